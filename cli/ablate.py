@@ -15,8 +15,8 @@ def ablate(pairs: tuple[Path, ...], judging: Judging) -> None:
     """Compare the paper's baseline, alpha-cuts at several levels, and the whole method on PAIRS.
 
     Every pair is matched once, in memory. The table shows the accuracy (share of valid pixels whose interval contains
-    the truth), averaged over the scenes of each group. The last column is the whole method, with regularisation. With --preset paper it is the
-    paper's table 2.
+    the truth), averaged over the scenes of each group. The last column is the whole method, with regularisation. With
+    --preset paper it is the paper's table 2.
 
     A pair is a folder with left.tif, right.tif, truth.tif and meta.json (`disparity`: [minimum, maximum], optionally
     `group`), or a row of a CSV file with the columns left, right, truth, minimum, maximum and optionally name and

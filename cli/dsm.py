@@ -21,9 +21,6 @@ from sat_intervals.cli.options import (
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
 
-# Copied from `sat_intervals.heights.choices`, which --help must not import.
-BOUNDS = ("envelope", "mean", "median", "nearest", "agreeing")
-
 _CELL_OPTIONS = (
     click.option("--resolution", type=float, metavar="METRES", help="Side of a cell; or give --grid-like."),
     click.option("--grid-like", type=FILE, help="North-up raster whose grid and CRS the surface takes."),
@@ -32,12 +29,9 @@ _CELL_OPTIONS = (
     click.option("--geoid", type=FILE, help="Geoid grid (GTX, GeoTIFF) that heights refer to."),
     click.option(
         "--bounds",
-        "--interval",
-        "bounds",
-        type=click.Choice(BOUNDS),
-        help="Interval of a cell: envelope of its points' intervals; mean or median of their bounds; that of the point "
-        "nearest to the cell's height; intersection of those that agree. Default: median for runs with a coverage, "
-        "else envelope.",
+        type=click.Choice(("envelope", "median")),
+        help="Interval of a cell: medians of its points' bounds (default for runs with a coverage), or the envelope of "
+        "their intervals (default for others).",
     ),
     click.option(
         "--keep-open/--drop-open",

@@ -119,14 +119,14 @@ def surface_options(command: Command) -> Command:
 def _drawn(given: SurfaceAndReference, folder: Path, line: Line | None, report: dict[str, Any]) -> list[Path]:
     """Write figures and pictures of a surface model to a folder; return their paths."""
     from sat_intervals.cli.tables import surface_markdown
-    from sat_intervals.evaluate.comparison import moved_by, open_comparison
+    from sat_intervals.evaluate.comparison import open_comparison
     from sat_intervals.evaluate.dsm import read_profile
     from sat_intervals.raster.publishing import write_file
     from sat_intervals.show.accuracy import draw_error_map, draw_height_profile, draw_reliability
 
     figures, table, reliability, errors, heights = paths = [folder / name for name in (*_TEXTS, *_PICTURES)]
     names = given.dsm.name, given.reference.name
-    compared = moved_by(open_comparison(given.dsm, given.reference), report["registration"])
+    compared = open_comparison(given.dsm, given.reference, report["registration"])
     profile = read_profile(compared, line)
     write_file(figures, json.dumps({"software": "sat-intervals"} | report, indent=1).encode())
     write_file(table, f"<!-- sat-intervals -->\n{surface_markdown(str(given.dsm), report)}".encode())

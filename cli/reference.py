@@ -67,7 +67,7 @@ def reference(
     if ellipsoid and geoid:
         raise click.UsageError("--ellipsoid and --geoid exclude each other.")
     from sat_intervals.cli.console import Console
-    from sat_intervals.heights.reference import Reference, SensorFiles, make_truth
+    from sat_intervals.heights.reference import Reference, make_truth
     from sat_intervals.raster import Vertical
     from sat_intervals.raster.publishing import check_free
 
@@ -75,9 +75,8 @@ def reference(
         check_free(output, overwrite=overwrite)
     vertical = Vertical(ellipsoid, geoid)
     given = Reference(heights or points, points is not None, vertical, crs)  # type: ignore[arg-type]
-    files = SensorFiles(*sensor_files)
     with Console(quiet or as_json) as console:
-        report = make_truth(out, files, given, path=output, registers=not no_register, progress=console.progress)
+        report = make_truth(out, sensor_files, given, path=output, registers=not no_register, progress=console.progress)
     _say_fit(console, report)
     console.say(
         f"{report['pixels']} pixels with a true disparity ({100 * report['share']:.1f} %), "

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 # Characters of a line in a file or a pipe: lines are not wrapped.
 _WIDEST = 10_000
+# What the nominal level of intervals is, in reports and for a reader.
+_NOMINAL = {"coverage": "coverage asked for", "alpha": "alpha"}
 _EXPECTED = ("all", "high", "low", "lowest", "mean width", "median width", "score")
 
 
@@ -50,7 +52,7 @@ def show_groups(rows: Sequence[Row], title: str) -> None:
 
 
 def show_scenes(scenes: Sequence[SceneMetrics]) -> None:
-    """Print the paper's table 1, and each scene's coverage beside the nominal one, with widths and interval scores."""
+    """Print the paper's table 1, and each scene's coverage beside the one asked for, with widths and scores."""
     show_groups(table_1(scenes), "means over scenes, valid pixels")
     _show_missed(scenes)
     paths = [
@@ -60,9 +62,10 @@ def show_scenes(scenes: Sequence[SceneMetrics]) -> None:
     figures = {scene.name: [look_up(scene.report, path) for path in paths] for scene in scenes}
     known = [[value for value in column if value is not None] for column in zip(*figures.values(), strict=True)]
     figures["mean"] = [sum(column) / len(column) if column else None for column in known]
-    header = ["", "nominal", "coverage", "high", "low", "mean width", "median width", "score"]
+    nominal = " or ".join(sorted({_NOMINAL[scene.report["nominal_is"]] for scene in scenes}, reverse=True))
+    header = ["", nominal, "coverage", "high", "low", "mean width", "median width", "score"]
     rows = [[name, *map(_figure, values)] for name, values in figures.items()]
-    show(header, rows, "coverage asked for (or alpha) and measured, widths and interval score (px), valid pixels")
+    show(header, rows, f"{nominal}, measured coverage, widths and interval score (px), valid pixels")
 
 
 def _show_missed(scenes: Sequence[SceneMetrics]) -> None:
@@ -86,10 +89,7 @@ def show_scene(scene: SceneMetrics) -> None:
     show(header, rows, scene.name)
     if not report["all"]["count"]:
         click.echo("no valid pixel has a known truth: check truth and mask")
-    if report["nominal"] is not None:
-        click.echo(
-            f"nominal coverage, or alpha: {report['nominal']:g}; the interval score judges for it, less is better"
-        )
+    click.echo(_nominal_line(report))
     bad = [_figure(report[name]) for name in ("bad1", "bad3")]
     click.echo(f"disparity wrong by more than 1 px: {bad[0]}, by more than 3 px: {bad[1]}")
     if report["tolerance"]:
@@ -148,14 +148,18 @@ def _surface_table(report: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
 
 
 def _notes(report: dict[str, Any]) -> list[str]:
-    nominal = report["nominal"]
     return [
         "errors are height - reference; bias is their mean; LE90: 90 % of the absolute errors are not larger",
-        "nominal coverage, or alpha: unknown, so no interval scores"
-        if nominal is None
-        else f"nominal coverage, or alpha: {nominal:g}; the interval score judges for it, less is better",
+        _nominal_line(report),
         *report["warnings"],
     ]
+
+
+def _nominal_line(report: dict[str, Any]) -> str:
+    """Return a line about the coverage asked for, or alpha."""
+    if report["nominal"] is None:
+        return "coverage asked for: unknown, so no interval scores"
+    return f"{_NOMINAL[report['nominal_is']]}: {report['nominal']:g}; the interval score judges for it, less is better"
 
 
 def registration_lines(found: dict[str, Any] | None) -> list[str]:

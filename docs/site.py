@@ -29,7 +29,7 @@ GRIDS = "--left-grid demo/left_grid.tif --right-grid demo/right_grid.tif"
 COMPARED = "--dsm demo/dsm.tif --reference demo/lidar.tif"
 # Commands of the gallery, run in the folder of its pictures: title, command, what it shows.
 GALLERY = (
-    ("A scene with exact truth", "sat-intervals demo demo --size 700 700 --coverage 0.9", None),
+    ("A scene with exact truth", "sat-intervals demo demo --size 700 700", None),
     ("Maps", "sat-intervals plot demo --dpi 90", "demo/overview.png"),
     ("Where intervals miss the truth", "sat-intervals plot demo --dpi 90", "demo/errors.png"),
     ("Coverage and width", "sat-intervals plot demo --dpi 90", "demo/coverage.png"),
@@ -43,7 +43,7 @@ GALLERY = (
     ("Its heights and half widths", "sat-intervals plot demo --dpi 90", "demo/dsm.png"),
     ("Its errors", f"sat-intervals evaluate {COMPARED} --pictures demo --overwrite", "demo/dsm-errors.png"),
     ("A line across it", f"sat-intervals evaluate {COMPARED} --pictures demo --overwrite", "demo/dsm-profile.png"),
-    ("A relief, with local search ranges", "sat-intervals demo relief --size 500 500 --relief 60 --local-range", None),
+    ("A relief, with local search ranges", "sat-intervals demo relief --size 500 500 --relief 60 --set disparity.local=true", None),
     ("Its maps", "sat-intervals plot relief --dpi 90", "relief/overview.png"),
 )  # fmt: skip
 
@@ -105,7 +105,7 @@ def title_of(model: type[BaseModel]) -> str:
     """Return the value by which a kind of section is chosen."""
     for key in ("method", "penalty"):
         if key in model.model_fields and (values := get_args(model.model_fields[key].annotation)):
-            return f"`{key}: {values[0]}`" + (" with MC-CNN" if model.__name__ in ("MccnnSgm", "CosineSgm") else "")
+            return f"`{key}: {values[0]}`" + (" with MC-CNN" if model.__name__ == "MccnnSgm" else "")
     return model.__name__
 
 

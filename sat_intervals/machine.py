@@ -1,7 +1,6 @@
 """Find the memory and the cores that this process may use: in a container or a job, less than the machine has."""
 
 import os
-import re
 import resource
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,7 +22,7 @@ def usable_cores() -> int:
 
 
 def _memory_limits(root: Path) -> Iterator[int]:
-    """Yield memory limits (bytes) of this process's cgroup and its ancestors; ``root`` contains ``proc`` and mounts."""
+    """Yield memory limits (bytes) of this process's cgroup and its ancestors; ``root`` has ``proc`` and ``sys``."""
     for folder in _cgroups(root, "memory"):
         yield from _numbers(folder / "memory.max")
         yield from _numbers(folder / "memory.limit_in_bytes")  # version 1; close to 2**63 means no limit
@@ -50,44 +49,19 @@ def _numbers(file: Path) -> list[int]:
 
 
 def _cgroups(root: Path, controller: str) -> Iterator[Path]:
-    """Yield the folders of this process's cgroup and of its mounted ancestors.
+    """Yield the folders of this process's cgroup and of its ancestors in ``/sys/fs/cgroup``.
 
-    A controller either has its own hierarchy (version 1) or belongs to the common one (version 2). The common hierarchy
-    may also exist without this controller.
+    A controller either has its own hierarchy (version 1) or belongs to the common one (version 2). A container may see
+    only the part below its own cgroup, which is then the top: folders named after what is above it are missing.
     """
     try:
-        groups, mounts = (
-            (root / "proc/self" / name).read_text(errors="surrogateescape").split("\n")[:-1]
-            for name in ("cgroup", "mountinfo")
-        )
+        groups = (root / "proc/self/cgroup").read_text(errors="surrogateescape").splitlines()
     except OSError:  # not Linux
         return
-    paths = {}
+    mounts = root / "sys/fs/cgroup"
     for line in groups:
         _, controllers, path = line.split(":", 2)
-        if not controllers:
-            paths["cgroup2"] = path
-        elif controller in controllers.split(","):
-            paths["cgroup"] = path
-    for line in mounts:
-        place, _, system = line.partition(" - ")
-        kind, _, options = system.split(" ", 2)
-        if kind not in paths or (kind == "cgroup" and controller not in options.split(",")):
-            continue
-        top, point = (re.sub(r"\\(\d{3})", lambda code: chr(int(code[1], 8)), text) for text in place.split(" ")[3:5])
-        names = _below(paths[kind], top)
-        if names is not None:
-            yield from (root.joinpath(point.lstrip("/"), *names[:depth]) for depth in range(len(names), -1, -1))
-
-
-def _below(path: str, top: str) -> list[str] | None:
-    """Return the path from the cgroup at the top of a mount down to ``path``; None if ``path`` is not below it.
-
-    A container may see only part of the hierarchy. Both paths start at the root of its cgroup namespace, and ``..``
-    means above it. For a mount from above, the names down to that root are unknown.
-    """
-    names, tops = ([name for name in text.split("/") if name] for text in (path, top))
-    rest = names[len(tops) :]
-    if names[: len(tops)] == tops and ".." not in rest:
-        return rest
-    return [] if tops.count("..") == len(tops) > names.count("..") else None
+        names = [name for name in path.split("/") if name]
+        tops = [mounts / controller] if controller in controllers.split(",") else []
+        for top in tops if controllers else (mounts, mounts / "unified"):
+            yield from (top.joinpath(*names[:depth]) for depth in range(len(names), -1, -1))

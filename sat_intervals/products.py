@@ -20,25 +20,6 @@ BOUND_STEPS = 64
 # MC-CNN's matching cost is 1 - cosine in steps of 1 / 125 = 0.008. Its codes, 0 to 250, fit in a byte.
 COSINE_STEPS = 125
 
-# Validity bits (METHOD.md, section 9). They have Pandora's numbers, so its tools read our files.
-LEFT_WINDOW = 1 << 0
-NO_CANDIDATE = 1 << 1
-RANGE_INCOMPLETE = 1 << 2
-NOT_REFINED = 1 << 3
-LEFT_MASKED = 1 << 6
-RIGHT_MASKED = 1 << 7
-OCCLUSION = 1 << 8
-MISMATCH = 1 << 9
-REGULARIZED = 1 << 11
-# Beyond Pandora's 0 to 12.
-RANGE_END = 1 << 13
-OPEN_BELOW = 1 << 14
-OPEN_ABOVE = 1 << 15
-
-REJECTED = OCCLUSION | MISMATCH
-UNMATCHED = LEFT_WINDOW | NO_CANDIDATE | LEFT_MASKED | RIGHT_MASKED
-INVALID = UNMATCHED | REJECTED
-
 
 @dataclass(frozen=True)
 class Flag:
@@ -55,6 +36,7 @@ class Flag:
         return 1 << self.bit
 
 
+# Validity bits (METHOD.md, section 9). To 12 they have Pandora's numbers, so its tools read our files.
 FLAGS = (
     Flag(0, "left_window", "the left window meets the image's border, no data or a mask", True),
     Flag(1, "no_candidate", "all candidates impossible: outside the right image or on its no data", True),
@@ -69,6 +51,12 @@ FLAGS = (
     Flag(14, "open_below", "interval open below: the disparity may be below the search range", False),
     Flag(15, "open_above", "interval open above: the disparity may be above the search range", False),
 )
+(
+    LEFT_WINDOW, NO_CANDIDATE, RANGE_INCOMPLETE, NOT_REFINED, LEFT_MASKED, RIGHT_MASKED, OCCLUSION, MISMATCH,
+    REGULARIZED, RANGE_END, OPEN_BELOW, OPEN_ABOVE,
+) = (flag.value for flag in FLAGS)  # fmt: skip
+REJECTED = OCCLUSION | MISMATCH
+INVALID = sum(flag.value for flag in FLAGS if flag.invalid)
 
 
 def flag_attributes() -> dict[str, object]:
@@ -104,29 +92,15 @@ BANDS = (
 
 
 class Bands(NamedTuple):
-    """Results of a run for some pixels, with truth and left image where they were read; all ``(rows, columns)``.
+    """Results of a run for some pixels, with truth and left image where they were read; all ``(rows, columns)``."""
 
-    Attributes
-    ----------
-    disparity, lower, upper
-        float32 pixels, NaN if missing.
-    confidence
-        float32, 0 to 1, NaN if missing.
-    validity
-        uint16 flags.
-    truth
-        True disparity in pixels, floats, NaN where unknown; empty if not read.
-    image
-        Grey values of the left image, floats, NaN where no data; empty if not read.
-    """
-
-    disparity: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    confidence: np.ndarray
-    validity: np.ndarray
-    truth: np.ndarray = np.empty((0, 0))
-    image: np.ndarray = np.empty((0, 0))
+    disparity: np.ndarray  # float32 pixels, NaN if missing
+    lower: np.ndarray  # the same
+    upper: np.ndarray  # the same
+    confidence: np.ndarray  # float32, 0 to 1, NaN if missing
+    validity: np.ndarray  # uint16 flags
+    truth: np.ndarray = np.empty((0, 0))  # true disparity in pixels, floats, NaN where unknown; empty if not read
+    image: np.ndarray = np.empty((0, 0))  # grey values of the left image, floats, NaN where no data; empty if not read
 
     @property
     def valid(self) -> np.ndarray:

@@ -95,9 +95,9 @@ class Run:
         """Open another raster of the same pixels, such as the truth."""
         image, left, here = open_image(path), self.report["inputs"]["left"], self.region.in_words
         size, there = (image.height, image.width), tags_beside(image.path, left).get("REGION", here)
-        if size == self.shape and there != here:
-            raise SatIntervalsError(f"{image.path} is of {there}, {self.out} of {here}: give one of this run")
         if size == self.shape:
+            if there != here:
+                raise SatIntervalsError(f"{image.path} is of {there}, {self.out} of {here}: give one of this run")
             return Layer(image, 0, 0)
         if size == (left["height"], left["width"]):
             return Layer(image, self.region.row, self.region.column)
@@ -171,7 +171,7 @@ def open_run(out: str | Path) -> Run:
         raise SatIntervalsError(f"{file}: {error.strerror}: give the folder of a finished run") from error
     except SatIntervalsError as error:
         raise SatIntervalsError(f"{file}: {error}") from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         where = ", see " + ".".join(map(str, error.errors()[0]["loc"])) if isinstance(error, ValidationError) else ""
         raise SatIntervalsError(f"{file} is not the report of a run{where}: match again with --overwrite") from error
     places = [_place(file.with_name(name), (bands, region.height, region.width)) for name, bands in _BANDS.items()]
@@ -212,7 +212,7 @@ def open_input(record: dict[str, Any]) -> Image:
         raise SatIntervalsError(f"{name}, an image of the run, is missing: move it back, or put a link to it there")
     nodata = None if nodata is None else float(nodata)
     image = open_image(name, band=record["band"], nodata=nodata, mask=mask and mask["path"])
-    if (found := (image.height, image.width)) != (size := (record["height"], record["width"])):
-        sizes = f"{found[0]} x {found[1]} pixels, but had {size[0]} x {size[1]}"
+    if (image.height, image.width) != (record["height"], record["width"]):
+        sizes = f"{image.height} x {image.width} pixels, but had {record['height']} x {record['width']}"
         raise SatIntervalsError(f"{name} has {sizes} when it was matched: restore it")
     return image

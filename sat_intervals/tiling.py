@@ -44,12 +44,8 @@ class Window:
     def clipped(self, other: "Window") -> "Window":
         """Return the intersection with ``other``; its size is zero if they do not overlap."""
         row, column = max(self.row, other.row), max(self.column, other.column)
-        return Window(
-            row,
-            column,
-            max(0, min(self.row_stop, other.row_stop) - row),
-            max(0, min(self.column_stop, other.column_stop) - column),
-        )
+        height = min(self.row_stop, other.row_stop) - row
+        return Window(row, column, max(0, height), max(0, min(self.column_stop, other.column_stop) - column))
 
     def relative_to(self, origin: "Window") -> "Window":
         """Return the same pixels, counted from the first pixel of ``origin``."""
@@ -145,7 +141,6 @@ def hull(windows: Sequence[Window]) -> Window:
 def facing(window: Window, minimum: int, maximum: int) -> Window:
     """Return the window of right pixels that are candidates of a left window over the search range.
 
-    Its first column is the candidate of the left window's first column at disparity ``minimum``. In arrays cut this
-    way, ``right[r, c + k]`` is the candidate of ``left[r, c]`` at disparity index ``k``.
+    In arrays cut this way, ``right[r, c + k]`` is the candidate of ``left[r, c]`` at disparity ``minimum + k``.
     """
     return Window(window.row, window.column + minimum, window.height, window.width + maximum - minimum)

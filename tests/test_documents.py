@@ -113,13 +113,11 @@ def test_commands__have_arguments_and_options_that_exist() -> None:
 NOT_RUN = {
     "s3://": "tests/store/test_remote.py",
     "--tune": "tests/run/test_calibrate.py",
-    "--cost mccnn": "tests/match/test_mccnn.py",
     "lidar.tif": "tests/evaluate/test_dsm.py: there are no heights of others for the demo scene",
     "dsm pair1/": "tests/heights/test_dsm.py, with runs made up",
     "heights.yaml": "tests/heights/test_dsm.py, with a calibration made up",
     "sat-intervals reference": "tests/heights/test_reference.py, likewise",
     "--truth out/truth.tif": "tests/heights/test_reference.py, with the truth of reference",
-    "peer_dsm": "tests/heights/test_reference.py, on a real pair",
 }
 
 
@@ -194,7 +192,7 @@ def test_code__of_all_documents_runs(place: Path, monkeypatch: pytest.MonkeyPatc
                 shutil.rmtree(place / "out")
             exec(code.replace("profile(640)", "profile(64)"), names | {"np": np})
             count += 1
-    assert count >= 3
+    assert count >= 2
 
 
 def test_site__has_a_page_for_every_document_and_every_setting() -> None:

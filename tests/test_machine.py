@@ -20,21 +20,13 @@ GB = 10**9
 PHYSICAL = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 NO_LIMIT = 9223372036854771712  # what version 1 says of none
 
-# Lines of mountinfo, to be completed by the cgroup at the top of the mount, and by the place of version 1's.
-V2 = "31 23 0:28 {0} /sys/fs/cgroup rw,relatime shared:4 - cgroup2 cgroup2 rw,nsdelegate"
-HYBRID = "41 31 0:38 {0} /sys/fs/cgroup/unified rw shared:9 master:1 - cgroup2 cgroup2 rw"
-MEMORY = "35 31 0:32 {0} /sys/fs/cgroup/memory rw,relatime - cgroup cgroup rw,memory"
-CPU = "32 31 0:29 {0} /sys/fs/cgroup/cpu,cpuacct rw,relatime - cgroup cgroup rw,cpu,cpuacct"
-DISK = "22 1 8:1 / / rw,relatime - ext4 /dev/root rw"
-
 IN_JOB = "9:memory:/slurm/job_7/step_0\n4:cpu,cpuacct:/slurm/job_7/step_0\n0::/"
 
 
-def made_up(root, groups, mounts, limits):
-    """A tree with the kernel's entries of this process, and files of limits by path below ``/sys/fs/cgroup``."""
+def made_up(root, groups, limits):
+    """A tree with the kernel's entry of this process, and files of limits by path below ``/sys/fs/cgroup``."""
     (root / "proc/self").mkdir(parents=True)
     (root / "proc/self/cgroup").write_text(groups + "\n")
-    (root / "proc/self/mountinfo").write_text("\n".join([DISK, *mounts]) + "\n")
     for name, text in limits.items():
         file = root / "sys/fs/cgroup" / name
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -43,109 +35,70 @@ def made_up(root, groups, mounts, limits):
 
 
 @pytest.mark.parametrize(
-    ("groups", "mounts", "limits", "expected"),
+    ("groups", "limits", "expected"),
     [
-        pytest.param("0::/a/b", [V2.format("/")], {"a/b/memory.max": GB, "a/memory.max": 2 * GB}, GB, id="v2 own"),
-        pytest.param("0::/a/b", [V2.format("/")], {"a/b/memory.max": 2 * GB, "a/memory.max": GB}, GB, id="v2 parent"),
-        pytest.param("0::/a/b/c", [V2.format("/")], {"a/b/c/memory.max": "max", "a/memory.max": GB}, GB, id="v2 far"),
-        pytest.param("0::/a", [V2.format("/")], {"a/memory.max": "max", "b/memory.max": GB}, None, id="v2 of others"),
-        pytest.param("0::/a (deleted)", [V2.format("/")], {"memory.max": GB}, GB, id="v2 own is gone"),
-        pytest.param("0::/", [V2.format("/")], {"memory.max": GB}, GB, id="v2 namespace"),
-        pytest.param("0::/", [V2.format("/..")], {"memory.max": GB}, GB, id="mounted from above the namespace"),
-        pytest.param("0::/a", [V2.format("/../..")], {"memory.max": GB, "a/memory.max": 1}, GB, id="names not known"),
-        pytest.param("0::/../b", [V2.format("/..")], {"b/memory.max": GB}, GB, id="process and mount from above"),
-        pytest.param("0::/../b", [V2.format("/")], {"memory.max": 1, "b/memory.max": 1}, None, id="process outside"),
-        pytest.param("0::/a", [V2.format("/../b")], {"memory.max": 1, "a/memory.max": 1}, None, id="a sibling's mount"),
-        pytest.param("0::/docker/x/a", [V2.format("/docker/x")], {"a/memory.max": GB}, GB, id="v2 part is mounted"),
-        pytest.param("0::/docker/xy", [V2.format("/docker/x")], {"memory.max": 1}, None, id="v2 other part is mounted"),
+        pytest.param("0::/a/b", {"a/b/memory.max": GB, "a/memory.max": 2 * GB}, GB, id="v2 own"),
+        pytest.param("0::/a/b", {"a/b/memory.max": 2 * GB, "a/memory.max": GB}, GB, id="v2 parent"),
+        pytest.param("0::/a/b/c", {"a/b/c/memory.max": "max", "a/memory.max": GB}, GB, id="v2 far"),
+        pytest.param("0::/a", {"a/memory.max": "max", "b/memory.max": GB}, None, id="v2 of others"),
+        pytest.param("0::/", {"memory.max": GB}, GB, id="v2 namespace"),
+        pytest.param("0::/docker/x", {"memory.max": GB}, GB, id="v2 container without a namespace"),
         pytest.param(
             IN_JOB,
-            [MEMORY.format("/"), CPU.format("/")],
             {
                 "memory/memory.limit_in_bytes": NO_LIMIT,
                 "memory/slurm/job_7/memory.limit_in_bytes": GB,
                 "memory/slurm/job_7/step_0/memory.limit_in_bytes": NO_LIMIT,
             },
             GB,
-            id="v1 parent",
+            id="v1 job",
         ),
-        pytest.param(
-            "5:memory:/docker/x\n1:name=systemd:/docker/x",
-            [MEMORY.format("/docker/x")],
-            {"memory/memory.limit_in_bytes": GB},
-            GB,
-            id="v1 container",
-        ),
-        pytest.param(
-            IN_JOB,
-            [HYBRID.format("/"), CPU.format("/"), MEMORY.format("/")],
-            {"memory/slurm/memory.limit_in_bytes": GB, "unified/cgroup.procs": 1},
-            GB,
-            id="hybrid, memory in v1",
-        ),
-        pytest.param(
-            "4:cpu,cpuacct:/\n0::/a",
-            [CPU.format("/"), HYBRID.format("/")],
-            {"unified/a/memory.max": GB},
-            GB,
-            id="hybrid, memory in v2",
-        ),
-        pytest.param("0::/a", [], {"memory.max": 1, "a/memory.max": 1}, None, id="nothing is mounted"),
+        pytest.param("5:memory:/docker/x", {"memory/memory.limit_in_bytes": GB}, GB, id="v1 container"),
+        pytest.param("4:cpu,cpuacct:/\n0::/a", {"unified/a/memory.max": GB}, GB, id="hybrid, memory in v2"),
+        pytest.param("0::/a", {}, None, id="no files"),
     ],
 )
-def test_memory_limits__are_those_of_the_cgroup_and_its_ancestors(tmp_path, groups, mounts, limits, expected):
-    found = machine._memory_limits(made_up(tmp_path, groups, mounts, limits))
+def test_memory_limits__are_those_of_the_cgroup_and_its_ancestors(tmp_path, groups, limits, expected):
+    found = machine._memory_limits(made_up(tmp_path, groups, limits))
     assert min((limit for limit in found if limit < NO_LIMIT), default=None) == expected
-
-
-def test_memory_limits__reads_mount_points_with_spaces(tmp_path):
-    mounts = [V2.format("/").replace("/sys/fs/cgroup", r"/sys/fs/cgroup/my\040groups")]
-    limits = {"my groups/a/memory.max": GB}
-    assert list(machine._memory_limits(made_up(tmp_path, "0::/a", mounts, limits))) == [GB]
 
 
 def test_memory_limits__there_are_none_without_cgroups(tmp_path):
     assert list(machine._memory_limits(tmp_path)) == []
     (tmp_path / "proc/self").mkdir(parents=True)
-    for name in ("cgroup", "mountinfo"):
-        (tmp_path / "proc/self" / name).touch()
+    (tmp_path / "proc/self/cgroup").touch()
     assert list(machine._memory_limits(tmp_path)) == []
 
 
 @pytest.mark.parametrize(
-    ("groups", "mounts", "limits", "expected"),
+    ("groups", "limits", "expected"),
     [
-        pytest.param(
-            "0::/a/b", [V2.format("/")], {"a/b/cpu.max": "max 100000", "a/cpu.max": "300000 100000"}, [3], id="v2"
-        ),
-        pytest.param("0::/a", [V2.format("/")], {"a/cpu.max": "150000 100000"}, [2], id="rounded up"),
-        pytest.param("0::/a", [V2.format("/")], {"a/cpu.max": "1000 100000"}, [1], id="at least one"),
+        pytest.param("0::/a/b", {"a/b/cpu.max": "max 100000", "a/cpu.max": "300000 100000"}, [3], id="v2"),
+        pytest.param("0::/a", {"a/cpu.max": "150000 100000"}, [2], id="rounded up"),
+        pytest.param("0::/a", {"a/cpu.max": "1000 100000"}, [1], id="at least one"),
         pytest.param(
             IN_JOB,
-            [MEMORY.format("/"), CPU.format("/")],
             {
-                "cpu,cpuacct/cpu.cfs_quota_us": -1,
-                "cpu,cpuacct/cpu.cfs_period_us": 100_000,
-                "cpu,cpuacct/slurm/cpu.cfs_quota_us": 100_000,
-                "cpu,cpuacct/slurm/cpu.cfs_period_us": 50_000,
-                "cpu,cpuacct/slurm/job_7/cpu.cfs_quota_us": 400_000,
-                "cpu,cpuacct/slurm/job_7/cpu.cfs_period_us": 100_000,
+                "cpu/cpu.cfs_quota_us": -1,
+                "cpu/cpu.cfs_period_us": 100_000,
+                "cpu/slurm/job_7/cpu.cfs_quota_us": 400_000,
+                "cpu/slurm/job_7/cpu.cfs_period_us": 100_000,
             },
-            [4, 2],
+            [4],
             id="v1",
         ),
     ],
 )
-def test_core_limits__are_quotas_over_periods(tmp_path, groups, mounts, limits, expected):
-    assert list(machine._core_limits(made_up(tmp_path, groups, mounts, limits))) == expected
+def test_core_limits__are_quotas_over_periods(tmp_path, groups, limits, expected):
+    assert list(machine._core_limits(made_up(tmp_path, groups, limits))) == expected
 
 
 def test_usable_memory_and_cores__are_the_least_of_all_limits(tmp_path, monkeypatch):
     limits = {"a/memory.max": GB // 2, "a/cpu.max": "100000 100000"}
-    monkeypatch.setattr(machine, "_ROOT", made_up(tmp_path / "tight", "0::/a", [V2.format("/")], limits))
+    monkeypatch.setattr(machine, "_ROOT", made_up(tmp_path / "tight", "0::/a", limits))
     assert (machine.usable_memory(), machine.usable_cores()) == (GB // 2, 1)
     limits = {"a/memory.max": 2**60, "a/cpu.max": "100000000 1000"}
-    monkeypatch.setattr(machine, "_ROOT", made_up(tmp_path / "wide", "0::/a", [V2.format("/")], limits))
+    monkeypatch.setattr(machine, "_ROOT", made_up(tmp_path / "wide", "0::/a", limits))
     assert machine.usable_memory() <= PHYSICAL
     assert machine.usable_cores() == len(os.sched_getaffinity(0))
 
@@ -195,7 +148,7 @@ def test_usable_memory_and_cores__are_at_most_those_of_a_cgroup(tmp_path, contro
             found = printed(what, lambda: (folder / "cgroup.procs").write_text(str(os.getpid())))
         else:
             inside = {f"a/{name}": text for name, text in limits.items()}
-            found = printed(what, root=made_up(tmp_path, "0::/a", [V2.format("/")], inside))
+            found = printed(what, root=made_up(tmp_path, "0::/a", inside))
     finally:
         if folder:
             folder.rmdir()

@@ -268,6 +268,4 @@ class Products(Section):
     """Content of the output bands."""
 
     keep_rejected: bool = Field(False, description="write values of pixels rejected by cross-checking")
-    compression: Literal["deflate", "zstd", "lerc", "none"] = Field(
-        "deflate", description="of the files; lerc changes intervals.tif by at most 0.01"
-    )
+    compression: Literal["deflate", "zstd"] = Field("deflate", description="of the files")

@@ -20,7 +20,7 @@ from sat_intervals.kernels.matching import cost_volume
 from sat_intervals.match.matching_cost import Area, cost_areas, view_windows
 from sat_intervals.match.mccnn import load_network
 from sat_intervals.match.memory import PROCESS_BYTES, check_memory, volume_bytes
-from sat_intervals.match.normalization import PairStatistics, blocks, moments, statistics_of
+from sat_intervals.match.normalization import ImageStatistics, PairStatistics, blocks, moments, statistics_of
 from sat_intervals.match.patch import Frame, kernel_settings, match_right, patch_areas
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, cut_rows, postprocess_strips
 from sat_intervals.products import NO_CANDIDATE, NO_DISPARITY, Bands
@@ -38,11 +38,8 @@ def ablate_pair(pair: Pair, config: Any = None, *, tolerance: float = 0.0) -> di
     """Evaluate the paper's baseline, and the method at several levels and with regularisation, on one pair.
 
     All results come from one aggregated cost volume, which must fit in memory, and are evaluated on the pixels that
-    pass cross-checking. The pair's search range and the method's alpha override those of ``config``. ``tolerance`` is
-    the distance in pixels up to which a truth outside an interval counts as inside.
-
-    Returns ``cost``, and for each of METHODS ``count``, ``accuracy``, ``relative_size`` and ``mean_width`` as
-    `evaluate_run`.
+    pass cross-checking. The pair's search range and the method's alpha override those of ``config``; ``tolerance`` is
+    that of `evaluate_run`. Returns ``cost``, and for each of METHODS the figures ``all`` of `evaluate_run`.
     """
     config = load_config(
         config, {"interval": {"alpha": 0.9}, "disparity": {"minimum": pair.minimum, "maximum": pair.maximum}}
@@ -61,7 +58,8 @@ def ablate_pair(pair: Pair, config: Any = None, *, tolerance: float = 0.0) -> di
     _check_memory(whole, config)
     areas = patch_areas(Frame.of_whole(whole), config)
     views = read_views((left, right), view_windows(areas, config))
-    methods, scale = _all_methods(views, areas, whole, config, _statistics((left, right), config))
+    statistics = PairStatistics(_statistics(left), _statistics(right)) if config.cost.needs_statistics else None
+    methods, scale = _all_methods(views, areas, whole, config, statistics)
     report: dict[str, Any] = {"cost": config.cost.method}
     criteria = criteria_of(config, tolerance)
     for method in METHODS:
@@ -71,15 +69,8 @@ def ablate_pair(pair: Pair, config: Any = None, *, tolerance: float = 0.0) -> di
     return report
 
 
-def _statistics(images: Sequence[Image], config: Config) -> PairStatistics | None:
-    if not config.cost.needs_statistics:
-        return None
-    return PairStatistics(
-        *(
-            statistics_of(moments(*read_window(image, block)) for block in blocks(image.height, image.width))
-            for image in images
-        )
-    )
+def _statistics(image: Image) -> ImageStatistics:
+    return statistics_of(moments(*read_window(image, block)) for block in blocks(image.height, image.width))
 
 
 def _check_memory(whole: Window, config: Config) -> None:

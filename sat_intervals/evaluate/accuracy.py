@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sat_intervals.evaluate.metrics import Intervals, share
 from sat_intervals.match.histogram import Histogram
 
 # Errors and widths are counted up to this many metres.
@@ -17,19 +18,27 @@ LARGEST = 500
 _NORMAL = 1.4826
 
 
-class Errors(NamedTuple):
-    """Errors (height - reference), interval widths, and distances of a missed reference from the interval, in metres.
+class Heights(NamedTuple):
+    """Heights of cells, their bounds, and reference heights: ``(n,)`` metres; NaN bounds without an interval."""
 
-    Widths and distances are NaN without an interval.
-    """
+    height: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    reference: np.ndarray
 
-    error: np.ndarray
-    width: np.ndarray
-    missed: np.ndarray
+    @property
+    def width(self) -> np.ndarray:
+        """Return the widths of the intervals."""
+        return np.asarray(self.upper - self.lower)
 
-    def of(self, chosen: np.ndarray) -> "Errors":
+    @property
+    def outside(self) -> np.ndarray:
+        """Return how far the reference is outside the intervals, negative inside."""
+        return np.asarray(np.maximum(self.lower - self.reference, self.reference - self.upper))
+
+    def of(self, chosen: np.ndarray) -> "Heights":
         """Return a part."""
-        return Errors(*(values[chosen] for values in self))
+        return Heights(*(values[chosen] for values in self))
 
 
 class Accuracy:
@@ -37,46 +46,39 @@ class Accuracy:
 
     def __init__(self, nominal: float | None) -> None:
         self._nominal = nominal
-        self._count = self._bounded = self._inside = 0
-        self._sum = self._squares = self._width = self._missed = 0.0
-        self._errors, self._widths = Histogram(-LARGEST, LARGEST, 1000), Histogram(0, LARGEST, 100)
+        self._count = 0
+        self._sum = self._squares = 0.0
+        self._errors, self._intervals = Histogram(-LARGEST, LARGEST, 1000), Intervals(LARGEST, nominal)
 
-    def add(self, errors: Errors) -> None:
+    def add(self, cells: Heights) -> None:
         """Add cells."""
-        self._count += errors.error.size
-        self._sum += float(errors.error.sum())
-        self._squares += float(np.square(errors.error).sum())
-        self._errors.add(errors.error)
-        bounded = errors.of(np.isfinite(errors.width))
-        self._bounded += bounded.error.size
-        self._inside += int((bounded.missed == 0).sum())
-        self._width += float(bounded.width.sum())
-        self._missed += float(bounded.missed.sum())
-        self._widths.add(bounded.width)
+        error = cells.height - cells.reference
+        self._count += error.size
+        self._sum += float(error.sum())
+        self._squares += float(np.square(error).sum())
+        self._errors.add(error)
+        bounded = cells.of(np.isfinite(cells.width))
+        self._intervals.add(np.maximum(bounded.outside, 0), bounded.width)
 
     def report(self) -> dict[str, Any]:
         """Return all figures, None without cells: metres, and shares of cells with an interval."""
         deviation, low, high = self._errors.deviation(), self._errors.quantile(0.05), self._errors.quantile(0.95)
-        median = self._widths.median()
-        is_scored = self._nominal is not None and self._nominal < 1
+        intervals = self._intervals.report()
+        halves = {
+            name: None if (width := intervals[f"{name}_width"]) is None else width / 2 for name in ("mean", "median")
+        }
         return {
             "count": self._count,
-            "bias": _mean(self._sum, self._count),
+            "bias": share(self._sum, self._count),
             "median": self._errors.median(),
             "nmad": None if deviation is None else _NORMAL * deviation,
-            "rmse": None if not self._count else float(np.sqrt(self._squares / self._count)),
+            "rmse": float(np.sqrt(self._squares / self._count)) if self._count else None,
             "le90": self._errors.quantile_of_absolutes(0.9),
             "p95_p5": None if low is None or high is None else high - low,
-            "with_interval": self._bounded,
-            "coverage": _mean(self._inside, self._bounded),
-            "mean_half_width": _mean(self._width / 2, self._bounded),
-            "median_half_width": None if median is None else median / 2,
-            "interval_score": _mean(self._width + 2 / (1 - self._nominal) * self._missed, self._bounded)
-            if is_scored and self._nominal is not None
-            else None,
+            "with_interval": intervals["count"],
+            "coverage": intervals["accuracy"],
+            "mean_half_width": halves["mean"],
+            "median_half_width": halves["median"],
+            "interval_score": intervals["interval_score"],
             "needed_half_width": None if self._nominal is None else self._errors.quantile_of_absolutes(self._nominal),
         }
-
-
-def _mean(total: float, count: int) -> float | None:
-    return total / count if count else None

@@ -14,16 +14,8 @@ import numpy as np
 from sat_intervals.config import HeightCalibration, WidthClass, surface_key
 from sat_intervals.config.calibration import COVERAGES
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.evaluate.comparison import (
-    NOT_MOVED,
-    Comparison,
-    check_common,
-    compared,
-    moved_by,
-    open_comparison,
-    registered,
-    tiles,
-)
+from sat_intervals.evaluate.accuracy import Heights
+from sat_intervals.evaluate.comparison import Comparison, check_common, compared, open_comparison, registered, tiles
 from sat_intervals.kernels.conformal import least_number, margins, widened
 from sat_intervals.raster import read_tags
 
@@ -33,25 +25,6 @@ _MOST = 1 << 20
 _CLASSES, _BLOCKS = (8, 4, 2, 1), 4
 # Metres: a larger median difference is another datum, not an error.
 _DATUM = 10.0
-
-
-class Sample(NamedTuple):
-    """Cells with a height, perhaps an interval, and a reference: ``(n,)`` metres, and the block of ground of each."""
-
-    height: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    reference: np.ndarray
-    block: np.ndarray
-
-    @property
-    def width(self) -> np.ndarray:
-        """Return the widths of the intervals."""
-        return np.asarray(self.upper - self.lower)
-
-    def of(self, chosen: np.ndarray) -> "Sample":
-        """Return a part."""
-        return Sample(*(values[chosen] for values in self))
 
 
 class Margins(NamedTuple):
@@ -75,12 +48,12 @@ def calibrate_surface(
     given = open_comparison(surface, reference)
     tags = read_tags(given.surface)
     coverage = _checked_coverage(given.surface, tags, coverage)
-    found = registered(given) if registers else None
-    moved = moved_by(given, found and found.report())
-    sample, cells_of_height = _sample(moved)
-    warnings = [NOT_MOVED] if registers and found is None else []
-    warnings += _datum_warnings(given, sample, moved.shift[2], is_registered=found is not None)
-    sample = sample.of(np.isfinite(sample.width))
+    moved, warnings = registered(given) if registers else (given, [])
+    is_moved = moved.registration is not None
+    sample, block, cells_of_height = _sample(moved)
+    warnings += _datum_warnings(moved, sample)
+    bounded = np.isfinite(sample.width)
+    sample, block = sample.of(bounded), block[bounded]
     fit = fitted(sample, cells_of_height, coverage)
     if fit is None:
         once = f" (those in a pixel of {given.resolution:.3g} m count as one)" if _coarser(given) > 1 else ""
@@ -98,15 +71,15 @@ def calibrate_surface(
         "software": f"sat-intervals {version('sat-intervals')}",
         "surface": str(given.surface),
         "reference": str(given.reference),
-        "shift": None if found is None else [round(float(value), 3) for value in moved.shift],
-        "before": _figures(sample, sample.lower, sample.upper),
-        "expected": _expected(sample, cells_of_height, coverage),
+        "shift": [round(value, 3) for value in moved.shift] if is_moved else None,
+        "before": _figures(sample),
+        "expected": _expected(sample, block, cells_of_height, coverage),
         "warnings": warnings,
     }
     return HeightCalibration(
         name=name,
         coverage=coverage,
-        registered=found is not None,
+        registered=is_moved,
         surface=surface_key(tags, given.cell),
         classes=classes,
         provenance=provenance,
@@ -131,14 +104,14 @@ def _coarser(given: Comparison) -> float:
     return max(1.0, round(given.resolution / given.cell, 3))
 
 
-def _sample(given: Comparison) -> tuple[Sample, float]:
-    """Return the heights of both, `_MOST` at most by chance, and the number of cells that one stands for."""
+def _sample(given: Comparison) -> tuple[Heights, np.ndarray, float]:
+    """Return heights, `_MOST` at most by chance, the block of ground of each, and the cells that one stands for."""
     random = np.random.default_rng(0)
     parts, common, gathered, share = [np.empty((6, 0))], 0, 0, 1.0
     for window in tiles(given):
-        cells = compared(given, window)
-        row, column = (place // given.finer for place in np.nonzero(cells.known))
-        values = np.stack([*cells[:4], row + window.row, column + window.column])
+        cells, known = compared(given, window)
+        row, column = (place // given.finer for place in np.nonzero(known))
+        values = np.stack([*cells, row + window.row, column + window.column])
         common += row.size
         parts.append(values[:, random.random(row.size) < share])
         gathered += parts[-1].shape[1]
@@ -146,10 +119,10 @@ def _sample(given: Comparison) -> tuple[Sample, float]:
             share /= 2
             parts = [part[:, random.random(part.shape[1]) < 0.5] for part in parts]
             gathered = sum(part.shape[1] for part in parts)
-    height, lower, upper, truth, row, column = np.concatenate(parts, axis=1)
+    *heights, row, column = np.concatenate(parts, axis=1)
     cells_of_all = common / (given.finer * _coarser(given)) ** 2
     block = _BLOCKS * _part(row) + _part(column)
-    return Sample(height, lower, upper, truth, block), min(1.0, cells_of_all / max(1, height.size))
+    return Heights(*heights), block, min(1.0, cells_of_all / max(1, block.size))
 
 
 def _part(place: np.ndarray) -> np.ndarray:
@@ -160,9 +133,9 @@ def _part(place: np.ndarray) -> np.ndarray:
     return np.asarray(_BLOCKS * (place - first) // count)
 
 
-def _datum_warnings(given: Comparison, sample: Sample, up: float, *, is_registered: bool) -> list[str]:
+def _datum_warnings(given: Comparison, sample: Heights) -> list[str]:
     """Return a warning if the heights differ by as much as two datums do; raise if the reference was not moved."""
-    median = float(np.median(sample.height - sample.reference)) + up if sample.height.size else None
+    median = float(np.median(sample.height - sample.reference)) + given.shift[2] if sample.height.size else None
     check_common(given, sample.height.size, median)
     if median is None or abs(median) <= _DATUM:
         return []
@@ -170,14 +143,13 @@ def _datum_warnings(given: Comparison, sample: Sample, up: float, *, is_register
         f"heights of {given.surface} and {given.reference} differ by {median:.1f} m in the median, as heights "
         "above a geoid and heights above the ellipsoid do"
     )
-    if is_registered:
+    if given.registration:
         return [f"{line}; the margins do not include it"]
     raise SatIntervalsError(f"{line}: make the surface with --geoid, convert the reference, or leave out --no-register")
 
 
-def fitted(sample: Sample, cells_of_height: float, coverage: float) -> Margins | None:
+def fitted(sample: Heights, cells_of_height: float, coverage: float) -> Margins | None:
     """Return margins by classes of width, of one class with few cells; None with too few for that."""
-    scores = np.maximum(sample.lower - sample.reference, sample.reference - sample.upper)
     width = sample.width
     for count in _CLASSES if width.size else ():
         # between centimetres, so that rounding does not part intervals of one width
@@ -186,37 +158,36 @@ def fitted(sample: Sample, cells_of_height: float, coverage: float) -> Margins |
         kinds = np.searchsorted(limits, width, side="right")
         cells = cells_of_height * np.bincount(kinds, minlength=limits.size + 1)
         if cells.min() >= least_number(coverage):
-            found = margins(scores, kinds, cells.size, coverage)
+            found = margins(sample.outside, kinds, cells.size, coverage)
             return Margins(limits, np.ceil(1000 * found) / 1000, cells)  # millimetres
     return None
 
 
-def held_out(sample: Sample, cells_of_height: float, coverage: float) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return bounds with the margins of the other blocks of ground; None if the others have too few cells."""
-    lower, upper = np.full((2, sample.height.size), np.nan)
-    for block in np.unique(sample.block):
-        own = sample.block == block
+def held_out(sample: Heights, block: np.ndarray, cells_of_height: float, coverage: float) -> Heights | None:
+    """Return the sample with margins of the other blocks of ground; None if the others have too few cells."""
+    lower, upper = np.full((2, block.size), np.nan)
+    for own in (block == number for number in np.unique(block)):
         fit = fitted(sample.of(~own), cells_of_height, coverage)
         if fit is None:
             return None
-        here = sample.of(own)
-        lower[own], upper[own] = widened(here.height, here.lower, here.upper, fit.limits, fit.margins)
-    return lower, upper
+        lower[own], upper[own] = widened(*sample.of(own)[:3], fit.limits, fit.margins)
+    return sample._replace(lower=lower, upper=upper)
 
 
-def _expected(sample: Sample, cells_of_height: float, coverage: float) -> dict[str, float | None] | None:
-    """Return figures of bounds that were held out, and the smallest coverage of a block with enough cells."""
-    bounds = held_out(sample, cells_of_height, coverage)
-    if bounds is None:
+def _expected(
+    sample: Heights, block: np.ndarray, cells_of_height: float, coverage: float
+) -> dict[str, float | None] | None:
+    """Return figures of intervals that were held out, and the smallest coverage of a block with enough cells."""
+    found = held_out(sample, block, cells_of_height, coverage)
+    if found is None:
         return None
-    inside = (bounds[0] <= sample.reference) & (sample.reference <= bounds[1])
-    blocks = [inside[sample.block == block] for block in np.unique(sample.block)]
-    of_blocks = [float(one.mean()) for one in blocks if one.size * cells_of_height >= least_number(coverage)]
-    return _figures(sample, *bounds) | {"lowest": round(min(of_blocks), 4) if of_blocks else None}
+    blocks = [found.outside[block == number] <= 0 for number in np.unique(block)]
+    of_blocks = [float(inside.mean()) for inside in blocks if inside.size * cells_of_height >= least_number(coverage)]
+    return _figures(found) | {"lowest": round(min(of_blocks), 4) if of_blocks else None}
 
 
-def _figures(sample: Sample, lower: np.ndarray, upper: np.ndarray) -> dict[str, float]:
+def _figures(sample: Heights) -> dict[str, float]:
     """Return coverage, median and mean width of intervals."""
-    inside, width = (lower <= sample.reference) & (sample.reference <= upper), upper - lower
+    inside, width = sample.outside <= 0, sample.width
     figures = {"coverage": inside.mean(), "median_width": np.median(width), "mean_width": width.mean()}
     return {name: round(float(value), 4) for name, value in figures.items()}

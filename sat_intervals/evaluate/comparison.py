@@ -3,13 +3,13 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.evaluate.accuracy import LARGEST
-from sat_intervals.kernels.registration import REACH, Blocks, Registration, register
+from sat_intervals.evaluate.accuracy import LARGEST, Heights
+from sat_intervals.kernels.registration import REACH, every_nth, put_together, register, spread_blocks
 from sat_intervals.raster import (
     GROUND,
     Georeferencing,
@@ -23,17 +23,15 @@ from sat_intervals.raster import (
 )
 from sat_intervals.tiling import Grid, Window
 
-NOT_MOVED = "the reference was not moved: too few common heights"
-"""Warning of a registration that was asked for and not possible."""
 # Heights compared at a time, some hundred bytes each.
 _TILE = 1 << 20
-# Blocks of each side that register, their sides in cells, and points of a block.
-_BLOCKS, _SMALLEST, _LARGEST_BLOCK, _POINTS = 8, 16, 256, 1000
+# Smallest side of the blocks that register, in cells.
+_SMALLEST = 16
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A surface model and its reference, moved by ``shift`` (metres: easting, northing, height).
+    """A surface model and its reference, moved by the shift of ``registration``, see `Registration.report`.
 
     ``resolution`` is the size of the reference's pixels in metres, ``finer`` the number of its heights along a cell.
     """
@@ -44,7 +42,12 @@ class Comparison:
     place: Georeferencing
     resolution: float
     finer: int
-    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    registration: dict[str, Any] | None = None
+
+    @property
+    def shift(self) -> tuple[float, float, float]:
+        """Return metres that the reference is moved by: easting, northing, height."""
+        return tuple(self.registration["shift"]) if self.registration else (0.0, 0.0, 0.0)
 
     @property
     def cell(self) -> float:
@@ -52,30 +55,20 @@ class Comparison:
         assert self.place.pixel_size is not None
         return self.place.pixel_size[0]
 
-    def heights(
-        self, window: Window, finer: int = 1, *, smooth: bool = False, needed: np.ndarray | None = None
-    ) -> np.ndarray:
-        """Read the moved reference in a window of cells, which may reach beyond the surface, ``finer`` per side."""
-        shape = finer * window.height, finer * window.width
-        smooth = smooth or self.shift[:2] != (0.0, 0.0)
-        return self.heights_at(self.place.shifted(window), shape, finer, smooth=smooth, needed=needed)
+    def cells(self, window: Window, finer: int = 1) -> tuple[Georeferencing, tuple[int, int]]:
+        """Return place and shape of a window of cells, perhaps beyond the surface, with ``finer`` per side of each."""
+        return self.place.shifted(window).refined(finer), (finer * window.height, finer * window.width)
 
-    def heights_at(
-        self,
-        place: Georeferencing,
-        shape: tuple[int, int],
-        finer: int = 1,
-        *,
-        smooth: bool = False,
-        needed: np.ndarray | None = None,
+    def heights(
+        self, place: Georeferencing, shape: tuple[int, int], *, smooth: bool = False, needed: np.ndarray | None = None
     ) -> np.ndarray:
-        """Read the moved reference in ``shape`` cells at a place, ``finer`` of them along each side of its cells.
+        """Read the moved reference at the centres of ``shape`` cells; if ``smooth`` or moved sideways, interpolate.
 
         Heights that no ground has are NaN, and errors where they are ``needed``: undeclared no data, or another unit.
         """
         east, north, up = self.shift
-        cells = place.moved(-east, -north).refined(finer)
-        heights = read_heights(self.reference, cells, shape, Window(0, 0, *shape), smooth=smooth)
+        cells, whole, is_between = place.moved(-east, -north), Window(0, 0, *shape), (east, north) != (0.0, 0.0)
+        heights = read_heights(self.reference, cells, shape, whole, smooth=smooth or is_between)
         wrong = (heights < GROUND[0]) | (heights > GROUND[1])
         if needed is not None and (found := heights[wrong & needed]).size:
             raise SatIntervalsError(
@@ -85,8 +78,10 @@ class Comparison:
         return np.where(wrong, np.nan, heights + up)
 
 
-def open_comparison(surface: str | Path, reference: str | Path) -> Comparison:
-    """Open a surface model and its reference."""
+def open_comparison(
+    surface: str | Path, reference: str | Path, registration: dict[str, Any] | None = None
+) -> Comparison:
+    """Open a surface model and its reference, which a registration moves."""
     surface, reference = Path(surface), Path(reference)
     shape, place = read_place(surface)
     if not is_surface(surface):
@@ -96,12 +91,7 @@ def open_comparison(surface: str | Path, reference: str | Path) -> Comparison:
     assert place.pixel_size is not None
     resolution = resolution_of(reference, place)
     finer = max(1, round(place.pixel_size[0] / resolution))
-    return Comparison(surface, reference, shape, place, resolution, finer)
-
-
-def moved_by(given: Comparison, registration: dict[str, Any] | None) -> Comparison:
-    """Return a comparison with the reference moved by the registration of a report."""
-    return given if registration is None else replace(given, shift=tuple(registration["shift"]))
+    return Comparison(surface, reference, shape, place, resolution, finer, registration)
 
 
 def check_common(given: Comparison, count: int, median: float | None) -> None:
@@ -123,54 +113,30 @@ def tiles(given: Comparison) -> Iterator[Window]:
     return (tile.core for tile in Grid(Window(0, 0, *given.shape), side))
 
 
-class ComparedCells(NamedTuple):
-    """Heights of a tile that both surface and reference have, ``(n,)`` metres; NaN bounds without an interval.
-
-    A cell counts once for each reference height; ``known`` is the mask of those of the tile.
-    """
-
-    height: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    reference: np.ndarray
-    known: np.ndarray
-
-
-def compared(given: Comparison, window: Window) -> ComparedCells:
-    """Read the cells of a tile and the reference there."""
+def compared(given: Comparison, window: Window) -> tuple[Heights, np.ndarray]:
+    """Read the cells of a tile that both have a height, once for each reference height; and the mask of these."""
     finer = given.finer
     height, lower, upper = (
         np.repeat(np.repeat(band, finer, axis=0), finer, axis=1)
         for band in read_layers(given.surface, window)[:3].astype(np.float64)
     )
-    reference = given.heights(window, finer, needed=np.isfinite(height))
+    reference = given.heights(*given.cells(window, finer), needed=np.isfinite(height))
     known = np.isfinite(reference) & np.isfinite(height)
-    return ComparedCells(height[known], lower[known], upper[known], reference[known], known)
+    return Heights(height, lower, upper, reference).of(known), known
 
 
-def registered(given: Comparison) -> Registration | None:
-    """Return the shift from the reference to the surface; None with too few heights."""
-    part = covered_window(given.reference, given.place, given.shape)
-    side = min(_LARGEST_BLOCK, max(_SMALLEST, min(part.height, part.width) // _BLOCKS))
-    grid = Grid(part, side)
-    size = side + 2 * (REACH + 1)
-    surfaces: list[np.ndarray] = []
-    parts: list[tuple[np.ndarray, ...]] = []
-    rows, columns = (range(0, count, max(1, -(-count // _BLOCKS))) for count in (grid.rows, grid.columns))
-    for core in (grid.tile(row, column).core for row in rows for column in columns):
+def registered(given: Comparison) -> tuple[Comparison, list[str]]:
+    """Return the comparison with the reference moved to the surface; the same and a warning with too few heights."""
+    parts = []
+    for core in spread_blocks(covered_window(given.reference, given.place, given.shape), _SMALLEST):
         height = read_layers(given.surface, core)[0].astype(np.float64)
         row, column = np.nonzero(np.isfinite(height))
-        if not row.size:
-            continue
-        chosen = slice(None, None, -(-row.size // _POINTS))
-        row, column = row[chosen], column[chosen]
-        around = Window(core.row - REACH - 1, core.column - REACH - 1, size, size)
-        surface = given.heights(around, smooth=True)
-        if np.isfinite(surface).any():
-            places = (column + REACH + 1.0, row + REACH + 1.0, height[row, column])
-            parts.append((np.full(row.size, len(surfaces)), *places))
-            surfaces.append(surface.astype(np.float32))
-    if not parts:
-        return None
-    block, x, y, heights = (np.concatenate(values) for values in zip(*parts, strict=True))
-    return register(Blocks(np.stack(surfaces), given.cell, block, x, y, heights, 1))
+        if row.size:
+            chosen = every_nth(row.size)
+            row, column = row[chosen], column[chosen]
+            surface = given.heights(*given.cells(core.grown(REACH + 1, REACH + 1)), smooth=True)
+            parts.append((surface, column + REACH + 1.0, row + REACH + 1.0, height[row, column]))
+    found = register(put_together(parts, given.cell, moves=1))
+    if found is None:
+        return given, ["the reference was not moved: too few common heights"]
+    return replace(given, registration=found.report()), []

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from sat_intervals.config import Config, Regularization
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.evaluate.metrics import Criteria, Evaluated, Metrics
+from sat_intervals.evaluate.metrics import Criteria, Metrics
 from sat_intervals.kernels.areas import area_maximum
 from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.match.histogram import bias_histogram
@@ -53,8 +54,8 @@ def evaluate_run(
     of truths outside the search range; ``deciles`` of confidence with their coverage. ``with_rejected`` contains the
     same over all pixels with an interval, None unless the run kept rejected pixels. ``bias`` is the bias removed
     (pixels), None without ``remove_bias``. ``truth_is_whole`` is true if all truths of valid pixels are whole numbers.
-    ``nominal`` is the coverage or the alpha of the run, for which ``interval_score`` judges. ``cost`` and
-    ``tolerance`` are the settings used.
+    ``nominal`` is the coverage or the alpha of the run, as ``nominal_is`` says, for which ``interval_score`` judges.
+    ``cost`` and ``tolerance`` are the settings used.
 
     Raises
     ------
@@ -65,29 +66,19 @@ def evaluate_run(
     config = run.config
     if config.interval is None:
         raise SatIntervalsError(f"{out} has no intervals, its setting interval is null: run match with intervals")
-    truth_layer = run.layer(_truth_beside(run) if truth is None else truth)
-    mask_layer = None if mask is None else run.layer(mask)
-    criteria = criteria_of(config, tolerance)
-
-    def strips() -> Iterator[Bands]:
-        return _read_strips(run, truth_layer, mask_layer)
-
-    figures = evaluate(strips, criteria, remove_bias=remove_bias, with_rejected=config.products.keep_rejected)
-    return {"cost": config.cost.method, **figures}
-
-
-def _truth_beside(run: Run) -> Path:
-    """Return the truth beside the left image; raise if there is none."""
-    if not run.truth_beside.exists():
+    if truth is None and not run.truth_beside.exists():
         left = run.report["inputs"]["left"]["path"]
         raise SatIntervalsError(f"{run.out}: there is no truth.tif beside its left image {left}: give --truth")
-    return run.truth_beside
+    strips = partial(_read_strips, run, run.layer(truth or run.truth_beside), None if mask is None else run.layer(mask))
+    criteria = criteria_of(config, tolerance)
+    figures = evaluate(strips, criteria, remove_bias=remove_bias, with_rejected=config.products.keep_rejected)
+    nominal_is = "alpha" if config.interval.coverage is None else "coverage"
+    return {"cost": config.cost.method, "nominal_is": nominal_is, **figures}
 
 
 def criteria_of(config: Config, tolerance: float = 0.0) -> Criteria:
     """Return the criteria for a run; without regularisation, low confidence follows the default settings."""
-    low, search = config.regularization or Regularization(), config.disparity
-    interval = config.interval
+    low, search, interval = config.regularization or Regularization(), config.disparity, config.interval
     level = None if interval is None else interval.coverage or interval.alpha
     nominal = None if level is None else float(level)
     return Criteria(search.minimum, search.maximum, low.threshold, low.kernel, low.depth, tolerance, nominal=nominal)
@@ -111,9 +102,9 @@ def evaluate(
     for rows, first, last in with_halo(strips(), criteria.depth):
         chosen = rows.known & rows.valid
         is_whole = is_whole and bool((rows.truth[chosen] % 1 == 0).all())
-        kept.add(_evaluated(rows, chosen, first, last, criteria))
+        kept.add(*_evaluated(rows, chosen, first, last, criteria))
         if with_rejected:
-            written.add(_evaluated(rows, rows.known, first, last, criteria))
+            written.add(*_evaluated(rows, rows.known, first, last, criteria))
     report = kept.report()
     return {
         **report,
@@ -134,8 +125,10 @@ def _median_bias(strips: Iterable[Bands]) -> float:
     return histogram.median() or 0.0
 
 
-def _evaluated(rows: Bands, chosen: np.ndarray, first: int, last: int, criteria: Criteria) -> Evaluated:
-    """Return the chosen pixels of rows ``[first, last)``; the other rows complete their low-confidence areas."""
+def _evaluated(
+    rows: Bands, chosen: np.ndarray, first: int, last: int, criteria: Criteria
+) -> tuple[Bands, np.ndarray, np.ndarray]:
+    """Return the chosen pixels of rows ``[first, last)``, see `Metrics.add`; the other rows complete their areas."""
     truth = rows.truth.astype(np.float64) + criteria.bias
     low = low_confidence(rows.confidence, criteria.threshold, criteria.kernel)
     error = np.where(chosen, np.abs(truth - rows.disparity), np.nan)
@@ -144,7 +137,7 @@ def _evaluated(rows: Bands, chosen: np.ndarray, first: int, last: int, criteria:
     chosen = chosen[inner]
     disparity, lower, upper, confidence = (band[inner][chosen].astype(np.float64) for band in rows[:4])
     pixels = Bands(disparity, lower, upper, confidence, rows.validity[inner][chosen], truth[inner][chosen])
-    return Evaluated(pixels, low[inner][chosen], area_error[inner][chosen])
+    return pixels, low[inner][chosen], area_error[inner][chosen]
 
 
 def _read_strips(run: Run, truth: Layer, mask: Layer | None) -> Iterator[Bands]:

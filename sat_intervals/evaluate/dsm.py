@@ -1,5 +1,6 @@
 """Evaluate a surface model and its intervals against reference heights, tile by tile."""
 
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -7,17 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.evaluate.accuracy import Accuracy, Errors
-from sat_intervals.evaluate.comparison import (
-    NOT_MOVED,
-    Comparison,
-    check_common,
-    compared,
-    moved_by,
-    open_comparison,
-    registered,
-    tiles,
-)
+from sat_intervals.evaluate.accuracy import Accuracy, Heights
+from sat_intervals.evaluate.comparison import Comparison, check_common, compared, open_comparison, registered, tiles
 from sat_intervals.raster import read_heights, read_layers, read_place, read_small_layers, read_tags
 from sat_intervals.tiling import Window
 
@@ -32,56 +24,60 @@ _MOST_CLASSES = 64
 _SAMPLES, _AT_ONCE = 4000, 256
 
 
-def nominal_of(surface: Path) -> float | None:
-    """Return the coverage, or alpha, that the intervals of a surface were made for; None if its runs differ."""
-    tags = read_tags(surface)
-    level = tags.get("COVERAGE", tags.get("ALPHA"))
-    return None if level is None else float(level)
+class _Ranges:
+    """Figures by ranges of a value between limits."""
+
+    def __init__(self, limits: tuple[float, ...], nominal: float | None) -> None:
+        self._kinds = {ends: Accuracy(nominal) for ends in pairwise(limits)}
+
+    def add(self, cells: Heights, values: np.ndarray) -> None:
+        for (first, last), kind in self._kinds.items():
+            kind.add(cells.of((first <= values) & (values < last)))
+
+    def report(self) -> list[dict[str, Any]]:
+        return [
+            {"from": first, "to": None if np.isinf(last) else last, **kind.report()}
+            for (first, last), kind in self._kinds.items()
+        ]
 
 
 def evaluate_surface(
     surface: str | Path, reference: str | Path, classes: str | Path | None = None, *, registers: bool = True
 ) -> dict[str, Any]:
-    """Evaluate the heights and intervals of a surface model.
+    """Evaluate the heights and intervals of a surface model against heights above the same datum, in any CRS.
 
-    The reference has heights above the same datum in any CRS. If it is n times finer than the cells, each cell is
-    compared with n x n heights; else with the one nearest to its centre, or interpolated there if the reference was
-    moved. ``classes`` is a raster of whole numbers, such as land cover. With ``registers`` the reference is moved by
-    its constant shift from the surface first.
+    With ``registers`` the reference is first moved by its constant shift from the surface. If it is n times finer than
+    the cells, each cell is compared with n x n heights; else with the one nearest to its centre, or interpolated there
+    if the reference was moved. ``classes`` is a raster of whole numbers, such as land cover.
 
-    Returns
-    -------
-    For ``all`` heights, by ``slope`` of the reference (degrees), by ``width`` of the interval (metres) and by
-    ``classes``: the figures of `Accuracy.report`. ``before``: those of all heights with the reference in its place.
-    ``from`` and ``to`` are the limits of a class, ``class`` its number. ``registration``, see `Registration.report`;
-    None without, or with too few heights (see ``warnings``). ``nominal``: coverage or alpha of the surface; None if
-    unknown.
+    Returns figures of `Accuracy.report` for ``all`` heights, ``before`` registration, by ``slope`` of the reference
+    (degrees), ``width`` of the interval (metres) and ``classes``; ``registration``, see `Registration.report`;
+    ``nominal``, the level of the intervals, and what it is (``nominal_is``): ``coverage``, ``alpha``, or None.
     """
     given = open_comparison(surface, reference)
-    nominal = nominal_of(given.surface)
+    tags = read_tags(given.surface)
+    nominal_is = next((name for name in ("coverage", "alpha") if name.upper() in tags), None)
+    nominal = float(tags[nominal_is.upper()]) if nominal_is else None
     if classes is not None:
         read_place(Path(classes))
-    found = registered(given) if registers else None
-    moved = moved_by(given, found and found.report())
+    moved, warnings = registered(given) if registers else (given, [])
     before, whole = Accuracy(nominal), Accuracy(nominal)
-    slopes, widths = ([Accuracy(nominal) for _ in ends[1:]] for ends in (SLOPES, WIDTHS))
+    slopes, widths = _Ranges(SLOPES, nominal), _Ranges(WIDTHS, nominal)
     kinds: dict[int, Accuracy] = {}
     for window in tiles(given):
-        errors, known = _errors(moved, window)
-        slope = _slope(moved, window)[known]
-        whole.add(errors)
-        for group, ends, values in ((slopes, SLOPES, slope), (widths, WIDTHS, errors.width)):
-            for kind, (first, last) in zip(group, pairwise(ends), strict=True):
-                kind.add(errors.of((first <= values) & (values < last)))
+        cells, known = compared(moved, window)
+        whole.add(cells)
+        slopes.add(cells, _slope(moved, window)[known])
+        widths.add(cells, cells.width)
         if classes is not None:
-            _add_classes(kinds, errors, _classes(given, Path(classes), window)[known], Path(classes), nominal)
+            for number, chosen in _classes(given, Path(classes), window, known):
+                kinds.setdefault(number, Accuracy(nominal)).add(cells.of(chosen))
         if moved is not given:
-            before.add(_errors(given, window)[0])
+            before.add(compared(given, window)[0])
     report = whole.report()
     in_place = before.report() if moved is not given else report
     check_common(given, in_place["count"], in_place["median"])
     coverage = report["coverage"]
-    warnings = [NOT_MOVED] if registers and found is None else []
     if nominal and coverage is not None and coverage < _POOR * nominal:
         warnings.append(
             f"the intervals contain {100 * coverage:.0f} % of the reference heights, where {100 * nominal:.0f} % are "
@@ -89,28 +85,22 @@ def evaluate_surface(
         )
     return {
         "nominal": nominal,
-        "registration": found and found.report(),
+        "nominal_is": nominal_is,
+        "registration": moved.registration,
         "warnings": warnings,
         "before": in_place,
         "all": report,
-        "slope": _by(slopes, SLOPES),
-        "width": _by(widths, WIDTHS),
+        "slope": slopes.report(),
+        "width": widths.report(),
         "classes": [{"class": number, **kinds[number].report()} for number in sorted(kinds)],
     }
-
-
-def _errors(given: Comparison, window: Window) -> tuple[Errors, np.ndarray]:
-    """Return the errors of a tile, and which heights of the tile they are."""
-    height, lower, upper, reference, known = compared(given, window)
-    missed = np.maximum(np.maximum(lower - reference, reference - upper), 0)
-    return Errors(height - reference, upper - lower, missed), known
 
 
 def _slope(given: Comparison, window: Window) -> np.ndarray:
     """Return the slope of the reference in degrees, from interpolated heights: those of pixels would form steps."""
     around = window.grown(1, 1).clipped(Window(0, 0, *given.shape))
     finer = given.finer
-    heights = given.heights(around, finer, smooth=True)
+    heights = given.heights(*given.cells(around, finer), smooth=True)
     place = window.relative_to(around)
     first, left = place.row * finer, place.column * finer
     rows, columns = window.height * finer, window.width * finer
@@ -120,28 +110,17 @@ def _slope(given: Comparison, window: Window) -> np.ndarray:
     return np.asarray(np.degrees(np.arctan(np.hypot(across, down))))
 
 
-def _classes(given: Comparison, path: Path, window: Window) -> np.ndarray:
-    shape = given.finer * window.height, given.finer * window.width
-    place = given.place.shifted(window).refined(given.finer)
-    return read_heights(path, place, shape, Window(0, 0, *shape))
-
-
-def _add_classes(
-    kinds: dict[int, Accuracy], errors: Errors, values: np.ndarray, path: Path, nominal: float | None
-) -> None:
-    for value in np.unique(values[np.isfinite(values)]):
-        if value % 1 or len(kinds) > _MOST_CLASSES:
-            raise SatIntervalsError(
-                f"{path} has values such as {value:g}, or more than {_MOST_CLASSES} of them: give a raster of classes"
-            )
-        kinds.setdefault(int(value), Accuracy(nominal)).add(errors.of(values == value))
-
-
-def _by(classes: list[Accuracy], ends: tuple[float, ...]) -> list[dict[str, Any]]:
-    return [
-        {"from": first, "to": None if np.isinf(last) else last, **kind.report()}
-        for kind, (first, last) in zip(classes, pairwise(ends), strict=True)
-    ]
+def _classes(given: Comparison, path: Path, window: Window, known: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield the classes of the heights of a tile, each with the mask of its heights."""
+    place, shape = given.cells(window, given.finer)
+    values = read_heights(path, place, shape, Window(0, 0, *shape))[known]
+    found = np.unique(values[np.isfinite(values)])
+    if (found % 1).any() or found.size > _MOST_CLASSES:
+        raise SatIntervalsError(
+            f"{path} has values such as {found[(found % 1).argmax()]:g}, or more than {_MOST_CLASSES} of them: give a "
+            "raster of classes"
+        )
+    yield from ((int(value), values == value) for value in found)
 
 
 class Profile(NamedTuple):
@@ -182,7 +161,7 @@ def read_profile(given: Comparison, line: tuple[float, float, float, float] | No
         window = Window(first, left, int(row[chosen].max()) + 1 - first, int(column[chosen].max()) + 1 - left)
         here = row[chosen] - first, column[chosen] - left
         bands[:3, chosen] = read_layers(given.surface, window)[:3][:, *here]
-        bands[3, chosen] = given.heights(window)[here]
+        bands[3, chosen] = given.heights(*given.cells(window))[here]
     ends = (line[0], line[1]), (line[2], line[3])
     return Profile(part * length, bands[0], bands[1], bands[2], bands[3], ends)
 
@@ -196,9 +175,8 @@ def error_map(given: Comparison, longest: int) -> tuple[np.ndarray, tuple[float,
     coarser = -(-max(given.shape) // longest)
     small = -(-rows // coarser), -(-columns // coarser)
     heights = read_small_layers(given.surface, small)[0].astype(np.float64)
+    truth = given.heights(given.place.coarser(columns / small[1], rows / small[0]), small)
     place = given.place.transform
     assert place is not None
-    across, down = columns / small[1], rows / small[0]
-    truth = given.heights_at(given.place.coarser(across, down), small)
     extent = place.c, place.c + columns * place.a, place.f + rows * place.e, place.f
     return heights - truth, extent

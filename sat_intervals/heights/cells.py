@@ -4,48 +4,45 @@ import math
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from sat_intervals.heights.choices import SurfaceChoices
-from sat_intervals.heights.fusion import calibrate, cells_of_run, fused, without_poor_cells
-from sat_intervals.heights.point_cloud import LISTED, Cells, PointCloud
+from sat_intervals.heights.fusion import calibrate, fused, without_poor_cells
+from sat_intervals.heights.point_cloud import Cells, PointCloud
+from sat_intervals.match.histogram import Histogram
 from sat_intervals.tiling import Window
 
 # Cells of a tile: some tens of megabytes.
 _TILE_ROWS, _TILE_COLUMNS = 512, 2048
 # Cells of a strip of tiles, 24 bytes each, a few strips in memory; tiles of wide surfaces have fewer rows.
 _STRIP_CELLS, _LOWEST = 1 << 22, 64
-# Points of all cells of a tile, where a cell's bounds need all its points: some 60 bytes each.
+# Points that reach the cells of a tile, for medians: some 60 bytes each.
 _LISTED_POINTS = 1 << 22
-# Widths are counted in steps of 2 cm, up to this many metres.
-_WIDEST = 1000
-# Metres: half widths above this are reported as a share.
+# Widths are counted in steps of 2 cm, up to so many metres.
+_STEPS, _WIDEST = 50, 1000
+# Metres: half widths from this on are reported as a share.
 WIDE = 20.0
-
-
-class Strip(NamedTuple):
-    """Bands of SURFACE ``(6, rows, columns)``, and the number of cells left out as poor."""
-
-    bands: np.ndarray
-    poor: int
 
 
 def strips(
     threads: ThreadPoolExecutor, clouds: Sequence[PointCloud], cells: Cells, radius: float, choices: SurfaceChoices
-) -> Iterator[tuple[int, Strip]]:
-    """Yield first row and content of full-width strips from the top; an error stops the running tiles."""
-    ended, bounds = threading.Event(), str(choices.bounds)
+) -> Iterator[tuple[int, np.ndarray, int]]:
+    """Yield full-width strips from the top: first row, bands of SURFACE ``(6, rows, columns)``, number of poor cells.
 
-    def tile(window: Window) -> Strip:
-        bands = fused([cells_of_run(cloud.splat(cells, window, radius, ended), bounds) for cloud in clouds])
+    An error stops the running tiles.
+    """
+    ended = threading.Event()
+
+    def tile(window: Window) -> tuple[np.ndarray, int]:
+        bands = fused([cloud.splat(cells, window, radius, ended) for cloud in clouds])
         if choices.calibration is not None:
             calibrate(bands, choices.calibration)
-        return Strip(bands, without_poor_cells(bands, choices.max_width, choices.min_confidence))
+        return bands, without_poor_cells(bands, choices.max_width, choices.min_confidence)
 
     rows, columns = min(_TILE_ROWS, max(_LOWEST, _STRIP_CELLS // cells.columns)), _TILE_COLUMNS
-    if bounds in LISTED:
+    if choices.bounds == "median":
         reaching = max(1.0, math.pi * (radius / cells.resolution) ** 2)
         of_cell = reaching * max(cloud.points_per_cell(cells.resolution) for cloud in clouds)
         rows, columns = _smaller(rows, columns, _LISTED_POINTS / of_cell)
@@ -56,11 +53,11 @@ def strips(
             for column in range(0, cells.columns, columns)
         )
         try:
-            tiles = list(threads.map(tile, windows))
+            bands, poor = zip(*threads.map(tile, windows), strict=True)
         except BaseException:
             ended.set()
             raise
-        yield row, Strip(np.concatenate([part.bands for part in tiles], axis=2), sum(part.poor for part in tiles))
+        yield row, np.concatenate(bands, axis=2), sum(poor)
 
 
 def _smaller(rows: int, columns: int, cells: float) -> tuple[int, int]:
@@ -74,28 +71,29 @@ class Tally:
     """Count the cells of a surface, and their widths."""
 
     def __init__(self) -> None:
-        self._poor = self._filled = self._shared = self._disagreeing = 0
-        self._widths = np.zeros(50 * _WIDEST + 1, np.int64)
+        self._poor = self._filled = self._shared = self._disagreeing = self._bounded = self._wide = 0
+        self._widths = Histogram(0, _WIDEST, _STEPS)
 
-    def add(self, strip: Strip) -> None:
-        """Add cells."""
-        height, lower, upper, *_, agreement = strip.bands
-        self._poor += strip.poor
+    def add(self, bands: np.ndarray, poor: int) -> None:
+        """Add cells, and the number of those left out as poor."""
+        height, lower, upper, *_, agreement = bands
+        width = upper - lower
+        width = width[np.isfinite(width)]
+        self._poor += poor
         self._filled += int(np.isfinite(height).sum())
         self._shared += int(np.isfinite(agreement).sum())
         self._disagreeing += int((agreement == 0).sum())
-        width = upper - lower
-        steps = np.minimum(50 * width[np.isfinite(width)], 50 * _WIDEST).astype(np.int64)
-        self._widths += np.bincount(steps, minlength=self._widths.size)
+        self._bounded += width.size
+        self._wide += int((width >= 2 * WIDE).sum())
+        self._widths.add(width)
 
     def report(self, cells: int) -> dict[str, Any]:
         """Return the figures, see `make_surface`, with shares of so many cells."""
-        count = int(self._widths.sum())
-        middle = int(np.searchsorted(np.cumsum(self._widths), (count + 1) // 2))
+        median = self._widths.median()
         return {
             "filled": self._filled / cells,
             "disagreeing": self._disagreeing / self._shared if self._shared else None,
-            "median_half_width": (middle + 0.5) / 100 if count else None,
-            "wide": int(self._widths[int(100 * WIDE) :].sum()) / count if count else None,
+            "median_half_width": None if median is None else median / 2,
+            "wide": self._wide / self._bounded if self._bounded else None,
             "poor_cells": self._poor,
         }

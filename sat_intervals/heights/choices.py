@@ -2,13 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 from sat_intervals.config import HeightCalibration, Interval
 from sat_intervals.errors import SatIntervalsError
 
-Bounds = Literal["envelope", "mean", "median", "nearest", "agreeing"]
-BOUNDS = "envelope", "mean", "median", "nearest", "agreeing"
+Bounds = Literal["envelope", "median"]
+BOUNDS: tuple[Bounds, ...] = get_args(Bounds)
 
 
 @dataclass(frozen=True)
@@ -18,10 +18,8 @@ class SurfaceChoices:
     Attributes
     ----------
     bounds
-        Interval of a cell: ``envelope`` contains those of all its points; ``mean`` is the weighted mean of their
-        bounds, ``median`` the median; ``nearest`` is that of the point nearest to the cell's height; ``agreeing`` is
-        the intersection of the largest number of intervals that meet. The last three are widened to the cell's height.
-        None: ``median`` for runs with a coverage, else ``envelope``.
+        Interval of a cell: ``envelope`` contains those of all its points; ``median`` has the medians of their bounds,
+        and contains the cell's height. None: ``median`` for runs with a coverage, else ``envelope``.
     keeps_open
         Whether points whose interval is open at an end of the search range contribute. None: not with a coverage.
     outliers, max_width

@@ -30,7 +30,6 @@ from sat_intervals.tiling import Window
 _CELLS_PER_POINT = 1000
 # Largest radius in cells: the work grows with its square.
 _REACH = 32
-_DEFAULTS = SurfaceChoices()
 # Metres: largest cell and largest radius.
 _LARGEST = 10_000.0
 
@@ -43,7 +42,7 @@ def make_surface(
     crs: str | None = None,
     radius: float | None = None,
     geoid: str | Path | None = None,
-    choices: SurfaceChoices = _DEFAULTS,
+    choices: SurfaceChoices | None = None,
     progress: Progress = lambda stage, done, total: None,
 ) -> dict[str, Any]:
     """Make a surface model from the points of one or several runs.
@@ -63,8 +62,8 @@ def make_surface(
     geoid
         Grid of geoid heights; heights then refer to the geoid, by default to the WGS 84 ellipsoid.
     choices
-        The cell's interval, and what is left out. The intervals of several runs are averaged where they meet, see
-        `fused`; else their hull is taken.
+        The cell's interval, and what is left out: by default nothing but, with a coverage, points whose interval is
+        open. The intervals of several runs are averaged where they meet; else their hull is taken.
     progress
         Callback, see `Progress`.
 
@@ -88,7 +87,7 @@ def make_surface(
     for run in runs:
         run.check_kept([path], [run.out / "points.tif", *given])
     intervals = [run.config.interval for run in runs]
-    choices = choices.for_intervals(intervals)
+    choices = (choices or SurfaceChoices()).for_intervals(intervals)
     tags = surface_tags([run.report["finished"] for run in runs], intervals, choices, resolution, radius)
     tags["HEIGHTS"] = f"above {geoid or 'the WGS 84 ellipsoid'}"
     projection = _projection(runs, crs, geoid)
@@ -98,10 +97,10 @@ def make_surface(
     writer = OutputWriter(path.parent, [surface_file(path.name)], cells.rows, cells.columns, place, tags)
     tally = Tally()
     with writer, ThreadPoolExecutor(usable_cores()) as threads:
-        for row, strip in strips(threads, clouds, cells, radius, choices):
-            tally.add(strip)
-            writer.write(row, strip.bands)
-            progress("cells", row + strip.bands.shape[1], cells.rows)
+        for row, bands, poor in strips(threads, clouds, cells, radius, choices):
+            tally.add(bands, poor)
+            writer.write(row, bands)
+            progress("cells", row + bands.shape[1], cells.rows)
         progress("files", 0, 1)
         writer.publish()
         progress("files", 1, 1)
@@ -165,9 +164,19 @@ def surface_tags(
 
 def _projection(runs: Sequence[Run], crs: str | None, geoid: Path | None) -> Projection:
     middle = point_near_the_middle(runs)
-    projection = Projection(utm_of(*middle) if crs is None else crs, geoid)
+    projection = Projection(crs or utm_of(*middle), geoid)
     projection.check(*middle)
     return projection
+
+
+def _clouds(
+    runs: Sequence[Run], projection: Projection, choices: SurfaceChoices, progress: Progress
+) -> list[PointCloud]:
+    clouds = []
+    for done, run in enumerate(runs):
+        progress("extent", done, len(runs))
+        clouds.append(PointCloud(run, projection, choices))
+    return clouds
 
 
 def _grid_of(path: Path, given: str | None) -> tuple[Cells, str]:
@@ -185,16 +194,6 @@ def _grid_of(path: Path, given: str | None) -> tuple[Cells, str]:
     code = place.crs.to_epsg()
     crs = f"EPSG:{code}" if code else place.crs.to_wkt()
     return Cells(place.transform.c, place.transform.f, across, rows, columns), crs
-
-
-def _clouds(
-    runs: Sequence[Run], projection: Projection, choices: SurfaceChoices, progress: Progress
-) -> list[PointCloud]:
-    clouds = []
-    for done, run in enumerate(runs):
-        progress("extent", done, len(runs))
-        clouds.append(PointCloud(run, projection, choices))
-    return clouds
 
 
 def _cells(clouds: Sequence[PointCloud], resolution: float, radius: float, grid: Cells | None) -> Cells:

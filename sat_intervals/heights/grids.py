@@ -3,15 +3,11 @@
 from pathlib import Path
 
 import numpy as np
+from scipy.interpolate import RegularGridInterpolator
+from shareloc.geofunctions.rectification_grid import RectificationGrid
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster import Georeferencing, read_known, read_tags
-
-try:
-    from scipy.interpolate import RegularGridInterpolator
-    from shareloc.geofunctions.rectification_grid import RectificationGrid
-except ModuleNotFoundError as error:
-    raise SatIntervalsError("triangulation needs shareloc: pip install 'sat-intervals[dsm]'") from error
 
 # OTB 8 tags every raster that it writes with this.
 _TAG, _OTB = "METADATATYPE", "OTB"

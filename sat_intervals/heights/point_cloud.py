@@ -11,27 +11,12 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.points import POINT, WINDOW, read_points
 from sat_intervals.kernels.disparity import median
-from sat_intervals.kernels.splat import (
-    AGREEING,
-    BOUNDED,
-    HEIGHT,
-    LEAST,
-    MEDIAN,
-    MOST,
-    NEAREST,
-    WEIGHT,
-    cell_bounds,
-    empty_cells,
-    reaching,
-    splat,
-)
+from sat_intervals.kernels.splat import BOUNDED, LOWER, UPPER, empty_cells, mean_heights, medians, splat
 from sat_intervals.products import OPEN_ABOVE, OPEN_BELOW
 from sat_intervals.raster import Projection
 from sat_intervals.results import Run
 from sat_intervals.tiling import Grid, Window
 
-# Bounds that need all points of a cell at once.
-LISTED = {"median": MEDIAN, "nearest": NEAREST, "agreeing": AGREEING}
 # Pixels around a point whose median outliers are compared with.
 _NEAR = 2
 
@@ -46,12 +31,8 @@ class Extent(NamedTuple):
 
     def intersects(self, other: "Extent") -> bool:
         """Return whether both share a point."""
-        return (
-            self.left <= other.right
-            and other.left <= self.right
-            and self.bottom <= other.top
-            and other.bottom <= self.top
-        )
+        meets = max(self.left, other.left) <= min(self.right, other.right)
+        return meets and max(self.bottom, other.bottom) <= min(self.top, other.top)
 
     def grown(self, margin: float) -> "Extent":
         """Return the rectangle grown by a margin on all sides."""
@@ -92,11 +73,11 @@ class PointCloud:
     because their interval is open at an end of the search range.
     """
 
-    def __init__(self, run: Run, projection: Projection, choices: SurfaceChoices | None = None) -> None:
+    def __init__(self, run: Run, projection: Projection, choices: SurfaceChoices) -> None:
         self.run = run
         self._path = run.out / "points.tif"
         self._projection = projection
-        self._choices = choices or SurfaceChoices().for_intervals([run.config.interval])
+        self._choices = choices
         self._extents: list[tuple[Window, Extent]] = []
         self.points = self.outliers = self.open = 0
         for tile in Grid(Window(0, 0, *run.shape), WINDOW):
@@ -160,7 +141,6 @@ class PointCloud:
     def splat(self, cells: Cells, window: Window, radius: float, ended: threading.Event) -> np.ndarray:
         """Accumulate the points in a window of cells, see `kernels.splat`; ``radius`` in metres; ``ended`` stops it."""
         gathered = empty_cells(window.height, window.width)
-        how = LISTED.get(str(self._choices.bounds))
         near = []
         place, reach = cells.extent(window), radius / cells.resolution
         for source, extent in self._extents:
@@ -180,26 +160,25 @@ class PointCloud:
                     height - down, lower - down, upper - down,
                 )  # fmt: skip
                 splat(*points, confidence[known].astype(np.float64), reach, gathered)
-                if how is not None:
+                if self._choices.bounds == "median":
                     near.append(_within(points, window, max(reach, 0.5)))
-        if how is not None and near:
-            _set_bounds(gathered, np.concatenate(near, axis=1), reach, how)
+        if near:
+            _set_medians(gathered, np.concatenate(near, axis=1), reach)
         return gathered
 
 
 def _within(points: tuple[np.ndarray, ...], window: Window, reach: float) -> np.ndarray:
-    """Return column, row, height and both bounds of the points with bounds within reach of a window: ``(5, n)``."""
+    """Return column, row and both bounds of the points with bounds within reach of a window: ``(4, n)``."""
     column, row, _, lower, upper = points
     inside = (-reach <= column) & (column <= window.width + reach) & (-reach <= row) & (row <= window.height + reach)
-    return np.stack([values[inside & np.isfinite(lower) & np.isfinite(upper)] for values in points])
+    inside &= np.isfinite(lower) & np.isfinite(upper)
+    return np.stack([values[inside] for values in (column, row, lower, upper)])
 
 
-def _set_bounds(gathered: np.ndarray, points: np.ndarray, reach: float, how: int) -> None:
-    """Replace the layers LEAST and MOST by bounds from all points of each cell."""
-    column, row, height, lower, upper = points
-    shape = gathered.shape[1:]
-    starts, of_cells = reaching(column, row, reach, *shape)
-    with np.errstate(invalid="ignore"):
-        middle = (gathered[HEIGHT] / gathered[WEIGHT]).ravel()
-    bounds = cell_bounds(starts, of_cells, height, lower, upper, middle, how).reshape(2, *shape)
-    gathered[[LEAST, MOST]] = np.where(gathered[BOUNDED] > 0, bounds, gathered[[LEAST, MOST]])
+def _set_medians(gathered: np.ndarray, points: np.ndarray, reach: float) -> None:
+    """Replace the bounds of each cell by the medians over its points, widened to the cell's height."""
+    column, row, *bounds = points
+    height = mean_heights(gathered)
+    for layer, bound, outwards in zip((LOWER, UPPER), bounds, (np.minimum, np.maximum), strict=True):
+        median_bound = medians(column, row, bound, reach, gathered[BOUNDED])
+        gathered[layer] = outwards(median_bound, height)

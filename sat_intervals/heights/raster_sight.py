@@ -1,14 +1,12 @@
 """Disparities of a raster of heights: the first height that each pixel's line of sight, of `Lattice`, meets."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
-from sat_intervals.heights.sensors import Lattice, Sensors
+from sat_intervals.heights.sensors import Lattice
 from sat_intervals.kernels.sight import seen_disparities, tops
 from sat_intervals.raster import HeightRaster, Projection
 from sat_intervals.tiling import Window
@@ -23,35 +21,28 @@ _STEEPEST = 70.0
 _MARGIN = 3
 
 
-class Shift(NamedTuple):
-    """Metres from the reference to the run: easting, northing, height."""
-
-    east: float = 0.0
-    north: float = 0.0
-    up: float = 0.0
-
-
-@dataclass(frozen=True)
-class Scene:
-    """What maps pixels of a run to the ground: sensors, region, width of the right image, and the map of the shift."""
-
-    sensors: Sensors
-    region: Window
-    right_width: int
-    projection: Projection
-
-
 class _FarError(Exception):
     """Raised when the lattice must cover more disparities; holds the new minimum and maximum."""
 
 
 class RasterSight:
-    """Disparities of a raster of heights, moved by ``shift``, strip by strip; ``search`` is a range to begin with."""
+    """Disparities of a raster of heights, strip by strip.
 
-    def __init__(self, scene: Scene, raster: HeightRaster, shift: Shift, search: tuple[int, int]) -> None:
-        self._scene, self._raster, self._shift = scene, raster, shift
+    ``lattice_of`` returns the `Lattice` of a run over disparities from the first to the second; those of ``search`` are
+    tried first. ``shift`` moves the raster on the map of ``projection``: easting, northing, height in metres.
+    """
+
+    def __init__(
+        self,
+        lattice_of: Callable[[int, int], Lattice],
+        raster: HeightRaster,
+        projection: Projection,
+        shift: np.ndarray,
+        search: tuple[int, int],
+    ) -> None:
+        self._lattice_of, self._raster, self._projection, self._shift = lattice_of, raster, projection, shift
         self._search = search
-        self._lattice = self._new_lattice()
+        self._lattice = lattice_of(*search)
         self._heights: dict[int, tuple[float, float]] = {}
         self._steepest = np.tan(np.radians(_STEEPEST)) * raster.cell / raster.frame.unit
 
@@ -59,7 +50,7 @@ class RasterSight:
         """Yield first row and disparities ``(rows, columns)``, NaN if unknown; ``pixel`` is metres on the ground."""
         side = int(_CELLS * self._raster.cell / pixel) // _LEAST * _LEAST
         side = min(_TILE, max(_LEAST, side))
-        height, width = self._scene.region.height, self._scene.region.width
+        height, width = self._lattice.region.height, self._lattice.region.width
         with ThreadPoolExecutor(_THREADS) as threads:
             for row in range(0, height, side):
                 window = Window(row, 0, min(side, height - row), width)
@@ -77,20 +68,18 @@ class RasterSight:
                 parts = list(threads.map(partial(self._tile, sights=sights, first=first, step=step), tiles))
             except _FarError as far:
                 self._search = far.args[0]
-                self._lattice = self._new_lattice()
+                self._lattice = self._lattice_of(*self._search)
                 continue
             return np.concatenate(parts, axis=1)
-
-    def _new_lattice(self) -> Lattice:
-        return Lattice(self._scene.sensors, self._scene.region, self._scene.right_width, *self._search)
 
     def _sights(self, window: Window) -> tuple[np.ndarray, tuple[float, float, float], tuple[float, float, float]]:
         """Return lines of sight in cells of the reference, from the highest point, and the place and step of nodes."""
         nodes, (row, column, disparity) = self._lattice.nodes(window)
         longitude, latitude, height = (nodes[..., index] for index in range(3))
-        x, y = self._scene.projection.place(longitude, latitude)
-        longitude, latitude = self._scene.projection.degrees(x - self._shift.east, y - self._shift.north)
-        sights = np.stack(self._raster.positions(longitude, latitude, height - self._shift.up), axis=-1)
+        x, y = self._projection.place(longitude, latitude)
+        east, north, up = self._shift
+        longitude, latitude = self._projection.degrees(x - east, y - north)
+        sights = np.stack(self._raster.positions(longitude, latitude, height - up), axis=-1)
         row_step, column_step, step = self._lattice.spacing
         if np.nanmedian(height[:, :, -1] - height[:, :, 0]) > 0:
             sights, disparity, step = sights[:, :, ::-1], disparity + step * (nodes.shape[2] - 1), -step

@@ -3,11 +3,12 @@
 Rasters are seen pixel by pixel; points go through inverse location. Both are registered to the points of the run.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -16,20 +17,12 @@ from sat_intervals.heights.location import GroundLattice, Location
 from sat_intervals.heights.point_files import PointFile
 from sat_intervals.heights.point_sight import PointSight
 from sat_intervals.heights.points import point_near_the_middle, read_points, triangulated
-from sat_intervals.heights.raster_sight import RasterSight, Scene, Shift
+from sat_intervals.heights.raster_sight import RasterSight
 from sat_intervals.heights.registering import blocks_of_points, blocks_of_raster
-from sat_intervals.heights.sensors import Sensors
-from sat_intervals.kernels.registration import LEAST, Blocks, Registration, register
+from sat_intervals.heights.sensors import Lattice, Sensors
+from sat_intervals.kernels.registration import LEAST, Registration, register
 from sat_intervals.progress import Progress
-from sat_intervals.raster import (
-    HeightRaster,
-    OutputWriter,
-    Projection,
-    Vertical,
-    read_layers,
-    truth_file,
-    utm_of,
-)
+from sat_intervals.raster import HeightRaster, OutputWriter, Projection, Vertical, read_layers, truth_file, utm_of
 from sat_intervals.raster.published import tag_of_left
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
@@ -46,15 +39,6 @@ _COMPARED, _OTHER = 100, 0.1
 _SWAPPED, _ENOUGH = -0.5, 500
 
 
-class SensorFiles(NamedTuple):
-    """Files of sensor models and epipolar grids, as `triangulate` takes them."""
-
-    left_model: Path
-    right_model: Path
-    left_grid: Path
-    right_grid: Path
-
-
 @dataclass(frozen=True)
 class Reference:
     """Reference heights: a raster, or points (CSV, LAS, LAZ, vector files); ``crs`` replaces that of the file."""
@@ -67,7 +51,7 @@ class Reference:
 
 def make_truth(
     out: str | Path,
-    files: SensorFiles,
+    sensor_files: Sequence[Path],
     reference: Reference,
     *,
     path: Path | None = None,
@@ -76,30 +60,30 @@ def make_truth(
 ) -> dict[str, Any]:
     """Write the disparities that reference heights have in a run, by default to ``truth.tif`` in its folder.
 
-    With ``registers`` the reference is moved by its constant shift from the points of the run first.
+    ``sensor_files`` are those of `triangulate`. With ``registers`` the reference is moved by its constant shift from
+    the points of the run first.
 
-    Returns
-    -------
-    ``pixels`` with a true disparity, and their share of the run, ``share``; ``outside_range``, the share of them
-    outside the search range; ``row_misfit``, median and largest distance in pixels between the rows at which both
-    images show a point; ``correlation`` of disparity and truth over valid pixels, None for few; ``registration``, None
-    without: ``shift`` and ``deviation`` (easting, northing, height in metres), ``is_horizontal``, ``used`` points, and
-    figures of height - reference ``before`` and ``after``, see `kernels.registration.summary`.
+    Returns ``pixels`` with a true disparity, and their share of the run, ``share``; ``outside_range``, the share of
+    them outside the search range; ``row_misfit``, median and largest distance in pixels between the rows at which both
+    images show a point; ``correlation`` of disparity and truth over valid pixels, None for few; ``registration``, see
+    `Registration.report`.
     """
     run = open_run(out)
     path = run.out / "truth.tif" if path is None else path
-    run.check_kept([path], [*files, reference.path, run.out / "points.tif"])
+    run.check_kept([path], [*sensor_files, reference.path, run.out / "points.tif"])
     if registers:
         triangulated([run.out])
-    work = _Work(run, Sensors.load(*files, left=run.left_georeferencing), reference)
-    if registers:
-        work.check_points()
+    work = _Work(run, Sensors.load(*sensor_files, left=run.left_georeferencing), reference)
     found = work.registration(progress) if registers else None
-    shift = Shift() if found is None else Shift(*map(float, found.shift))
-    tags = {"RUN": run.report["finished"], "REFERENCE": str(reference.path), "REGION": run.region.in_words}
-    tags["SOFTWARE"] = "sat-intervals"
+    shift = np.zeros(3) if found is None else found.shift
+    tags = {
+        "RUN": run.report["finished"],
+        "REFERENCE": str(reference.path),
+        "REGION": run.region.in_words,
+        "SOFTWARE": "sat-intervals",
+        "SHIFT": " ".join(f"{part:.3f}" for part in shift) + " m",
+    }
     tags |= tag_of_left(run.report["inputs"]["left"])
-    tags["SHIFT"] = " ".join(f"{part:.3f}" for part in shift) + " m"
     tally = _Tally(run)
     with (
         OutputWriter(path.parent, [truth_file(path.name)], *run.shape, run.georeferencing, tags) as writer,
@@ -123,10 +107,8 @@ class _Work:
         search, region = run.config.disparity, run.region
         self._search = search.minimum, search.maximum
         self._location = Location(sensors)
-        rows, columns = (
-            np.linspace(first, first + size - 1, _CHECKED)
-            for first, size in ((region.row, region.height), (region.column, region.width))
-        )
+        rows = np.linspace(region.row, region.row_stop - 1, _CHECKED)
+        columns = np.linspace(region.column, region.column_stop - 1, _CHECKED)
         row, column, disparity = (axis.ravel() for axis in np.meshgrid(rows, columns, self._search, indexing="ij"))
         ground = sensors.triangulate(row, column, disparity)
         seen = self._location.positions(*ground[:, :3].T)
@@ -141,7 +123,6 @@ class _Work:
         opener = PointFile if reference.is_points else HeightRaster
         self._heights = opener(reference.path, reference.crs, reference.vertical)
         self._heights.frame.check(*self.place)
-        self._scene = Scene(sensors, region, run.report["inputs"]["right"]["width"], self._projection)
 
     def _scale(self) -> tuple[float, float]:
         """Return metres of a pixel on the ground, and the change of disparity for a height of as many metres."""
@@ -153,7 +134,7 @@ class _Work:
         pixel = float(np.hypot(x[1] - x[0], y[1] - y[0]))
         return pixel, pixel / float(ends[2, 2] - ends[0, 2])
 
-    def check_points(self) -> None:
+    def _check_points(self) -> None:
         """Raise if the points of the run were made with other models or grids."""
         region, out = self.run.region, self.run.out
         for window in self.run.windows():
@@ -170,15 +151,14 @@ class _Work:
 
     def registration(self, progress: Progress) -> Registration:
         """Return the shift from the reference to the points of the run."""
+        self._check_points()
         progress("registration", 0, 1)
         point_near_the_middle([self.run])  # raises without a point
-        blocks: Blocks | None
         if isinstance(self._heights, HeightRaster):
             blocks = blocks_of_raster(self.run, self._heights, self._projection, self._pixel)
         else:
-            sample = self._sample(progress)
-            blocks = blocks_of_points(self.run, sample, self._projection, self._pixel) if len(sample) else None
-        found = None if blocks is None else register(blocks)
+            blocks = blocks_of_points(self.run, self._sample(progress), self._projection, self._pixel)
+        found = register(blocks)
         if found is None:
             raise SatIntervalsError(
                 f"{self._path} has fewer than {LEAST} heights where {self.run.out} has points, at "
@@ -213,30 +193,34 @@ class _Work:
                 kept, keys = kept[least], keys[least]
         return kept
 
-    def strips(self, shift: Shift, file: BinaryIO, progress: Progress) -> Iterator[tuple[int, np.ndarray]]:
+    def strips(self, shift: np.ndarray, file: BinaryIO, progress: Progress) -> Iterator[tuple[int, np.ndarray]]:
         """Yield the first row and the true disparities of strips from the top; points are kept in an empty file."""
-        height = self.run.shape[0]
         if isinstance(self._heights, HeightRaster):
-            for row, strip in RasterSight(self._scene, self._heights, shift, self._search).strips(self._pixel):
-                progress("truth", row + len(strip), height)
-                yield row, strip
-            return
+            right_width = self.run.report["inputs"]["right"]["width"]
+            lattice_of = partial(Lattice, self._sensors, self.run.region, right_width)
+            sight = RasterSight(lattice_of, self._heights, self._projection, shift, self._search)
+            strips = sight.strips(self._pixel)
+        else:
+            strips = self._points_seen(shift, file, progress).strips()
+        for row, strip in strips:
+            progress("truth", row + len(strip), self.run.region.height)
+            yield row, strip
+
+    def _points_seen(self, shift: np.ndarray, file: BinaryIO, progress: Progress) -> PointSight:
         sight = PointSight(file, self.run.region, self._rise)
         lattice = self._lattice(shift, progress)
         if lattice is not None:
             for part in self._near(progress):
                 row, column, _, right = lattice.positions(part + shift).T
                 sight.add(row, column, right - column)
-        for row, strip in sight.strips():
-            progress("truth", row + len(strip), height)
-            yield row, strip
+        return sight
 
-    def _lattice(self, shift: Shift, progress: Progress) -> GroundLattice | None:
+    def _lattice(self, shift: np.ndarray, progress: Progress) -> GroundLattice | None:
         """Return the lattice around all points near the run; None without a point."""
         lowest, highest = np.full(3, np.inf), np.full(3, -np.inf)
         for part in self._near(progress):
-            if len(part):
-                lowest, highest = np.minimum(lowest, part.min(axis=0)), np.maximum(highest, part.max(axis=0))
+            lowest = np.minimum(lowest, part.min(axis=0, initial=np.inf))
+            highest = np.maximum(highest, part.max(axis=0, initial=-np.inf))
         if not np.isfinite(lowest).all():
             return None
         return GroundLattice(self._location, self._projection, lowest + shift, highest + shift, self._pixel)

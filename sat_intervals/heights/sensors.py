@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError, check_file
-from sat_intervals.heights.grids import read_grid
 from sat_intervals.kernels.compiled import kernels_of_others
 from sat_intervals.kernels.lattice import interpolate
 from sat_intervals.raster import GROUND, Georeferencing
@@ -21,6 +20,8 @@ try:
         from shareloc.geofunctions.rectification_grid import RectificationGrid
         from shareloc.geofunctions.triangulation import epipolar_triangulation
         from shareloc.geomodels import GeoModel
+
+        from sat_intervals.heights.grids import read_grid
 except ModuleNotFoundError as error:
     raise SatIntervalsError("triangulation needs shareloc: pip install 'sat-intervals[dsm]'") from error
 
@@ -111,7 +112,7 @@ class Lattice:
         _check_cover(sensors, region, right_width, minimum, maximum)
         self.residual = _median_residual(sensors, region, minimum, maximum)
         """Median distance between lines of sight at some positions, in metres."""
-        self._sensors = sensors
+        self._sensors, self.region = sensors, region
         self._minimum = float(minimum)
         (self._rows, row_step) = _axis(region.row, region.row_stop - 1)
         self._columns, column_step = _axis(region.column, region.column_stop - 1)

@@ -11,16 +11,23 @@ between blocks.
 Letters: i, j row and column of a block's surface.
 """
 
+import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from sat_intervals.kernels.compiled import cached
+from sat_intervals.tiling import Grid, Window
 
 REACH = 48
 """Cells: largest shift that is searched; surfaces reach as far beyond the points."""
 LEAST = 30
 """Points on known heights that an estimate needs."""
+ACROSS, POINTS = 8, 1000
+"""Blocks along each side of the ground, about, and points of a block."""
+# Largest side of a block in cells or pixels.
+_LARGEST = 256
 # Steps of the search in cells: on some points, then on all.
 _COARSE, _FINE = (4.0, 2.0, 1.0), (0.5, 0.2, 0.1, 0.05, 0.02)
 _SEARCHED, _LEAST_BLOCKS = 8_000, 4
@@ -52,6 +59,37 @@ class Blocks(NamedTuple):
     y: np.ndarray
     height: np.ndarray
     moves: int
+
+
+def block_side(height: int, width: int, smallest: int) -> int:
+    """Return the side of blocks of a region of so many rows and columns."""
+    return min(_LARGEST, max(smallest, min(height, width) // ACROSS))
+
+
+def spread_blocks(region: Window, smallest: int) -> list[Window]:
+    """Return blocks of a region, spread evenly, about `ACROSS` along each side."""
+    grid = Grid(region, block_side(region.height, region.width, smallest))
+    rows, columns = (range(0, count, max(1, math.ceil(count / ACROSS))) for count in (grid.rows, grid.columns))
+    return [grid.tile(row, column).core for row in rows for column in columns]
+
+
+def every_nth(count: int) -> slice:
+    """Return which of the points of a block to take: `POINTS` at most."""
+    return slice(None, None, max(1, math.ceil(count / POINTS)))
+
+
+def put_together(parts: Sequence[tuple[np.ndarray, ...]], cell: float, moves: int) -> Blocks | None:
+    """Make blocks of surfaces, each with x, y and height of its points; None if no height of a surface is known."""
+    parts = [part for part in parts if np.isfinite(part[0]).any()]
+    if not parts:
+        return None
+    surfaces = [part[0] for part in parts]
+    whole = np.full((len(parts), *np.max([surface.shape for surface in surfaces], axis=0)), np.nan, np.float32)
+    for filled, surface in zip(whole, surfaces, strict=True):
+        filled[: surface.shape[0], : surface.shape[1]] = surface
+    block = np.repeat(np.arange(len(parts)), [part[1].size for part in parts])
+    x, y, height = (np.concatenate([part[index] for part in parts]) for index in (1, 2, 3))
+    return Blocks(whole, cell, block, x, y, height, moves)
 
 
 class Registration(NamedTuple):
@@ -97,8 +135,10 @@ def sampled(surface, block, x, y):
     return result
 
 
-def register(blocks: Blocks) -> Registration | None:
+def register(blocks: Blocks | None) -> Registration | None:
     """Estimate the shift; None with fewer than `LEAST` points on known heights."""
+    if blocks is None:
+        return None
     before = _differences(blocks, np.zeros(2))
     if np.isfinite(before).sum() < LEAST:
         return None

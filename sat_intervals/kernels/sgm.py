@@ -136,8 +136,7 @@ def advance_wave(candidates, span, penalties, paths, slots, wave, r, c):
     """Advance the two paths of a wave by the pixel ``(r, c)``."""
     curves, lowest, spans = paths
     p1, p2, row = penalties
-    i = 2 * wave
-    pair = slots[i], slots[i + 1]
+    i, pair = (0, (slots[0], slots[1])) if wave == 0 else (2, (slots[2], slots[3]))
     path_1, path_2 = _begin(paths, pair[0], span.start), _begin(paths, pair[1], span.start)
     for k in range(span.start, span.stop, LANES):
         costs = candidate_costs(candidates, r, c, k)

@@ -1,21 +1,40 @@
-"""Accumulation of ground points in the cells of a grid, and bounds of a cell from those of all its points.
+"""Ground points gathered in the cells of a grid: sums over the points that reach a cell, and medians of their bounds.
 
 Letters: n point; i, j row and column of a cell; u, v column and row of a point, in cells from the first cell's centre.
 """
 
 import numpy as np
 
-from sat_intervals.kernels.compiled import cached
+from sat_intervals.kernels.compiled import cached, inlined
 
 # Layers of the cells.
-WEIGHT, HEIGHT, CONFIDENCE, LOWER, UPPER, LEAST, MOST, COUNT, BOUNDED = range(9)
+WEIGHT, HEIGHT, CONFIDENCE, COUNT, BOUNDED, LOWER, UPPER = range(7)
 
 
 def empty_cells(rows: int, columns: int) -> np.ndarray:
-    """Cells without points: ``(9, rows, columns)`` float64, see `splat`."""
-    cells = np.zeros((9, rows, columns))
-    cells[LEAST], cells[MOST] = np.inf, -np.inf
+    """Cells without points: ``(7, rows, columns)`` float64, see `splat`."""
+    cells = np.zeros((7, rows, columns))
+    cells[LOWER], cells[UPPER] = np.inf, -np.inf
     return cells
+
+
+def mean_heights(cells: np.ndarray) -> np.ndarray:
+    """Weighted mean of the heights of the points that reach each cell: ``(rows, columns)``, NaN without points."""
+    nothing = np.full(cells.shape[1:], np.nan)
+    return np.divide(cells[HEIGHT], cells[WEIGHT], out=nothing, where=cells[COUNT] > 0)
+
+
+@inlined
+def _around(place, radius, size):
+    """First cell along an axis whose centre a point may reach, and the one after the last."""
+    reach = max(radius, 0.5)
+    return max(0, int(np.ceil(place - reach))), min(size, int(np.floor(place + reach)) + 1)
+
+
+@inlined
+def _reaches(down, across, radius):
+    """Whether a point reaches a cell from whose centre it is so far: the one it falls in, those within ``radius``."""
+    return down**2 + across**2 <= radius**2 or max(abs(down), abs(across)) <= 0.5
 
 
 @cached
@@ -26,108 +45,58 @@ def splat(column, row, height, lower, upper, confidence, radius, cells):
 
     column, row: ``(n,)`` positions in cells from the upper left corner of the first cell, whose centre is at 0.5, 0.5.
     height, lower, upper, confidence: ``(n,)``; points of NaN height and NaN bounds are ignored.
-    cells: ``(9, rows, columns)`` float64, updated: sums of weights and of weighted height, confidence, lower and upper
-        bound; the smallest lower and the largest upper bound; the number of points; the sum of the weights of points
-        with bounds.
+    cells: ``(7, rows, columns)`` float64, updated: sums of weights, of weighted heights and of weighted confidences;
+        numbers of points and of points with bounds; the smallest lower and the largest upper bound.
     """
     rows, columns = cells.shape[1:]
     for n in range(height.size):
         if np.isnan(height[n]):
             continue
+        has_bounds = not (np.isnan(lower[n]) or np.isnan(upper[n]))
         u, v = column[n] - 0.5, row[n] - 0.5
-        reach = max(radius, 0.5)
-        for i in range(max(0, int(np.ceil(v - reach))), min(rows, int(np.floor(v + reach)) + 1)):
-            for j in range(max(0, int(np.ceil(u - reach))), min(columns, int(np.floor(u + reach)) + 1)):
-                square = (i - v) ** 2 + (j - u) ** 2
-                if square > radius**2 and max(abs(i - v), abs(j - u)) > 0.5:
+        for i in range(*_around(v, radius, rows)):
+            for j in range(*_around(u, radius, columns)):
+                if not _reaches(i - v, j - u, radius):
                     continue
-                weight = np.exp(-0.5 * min(square, 900.0))
+                weight = np.exp(-0.5 * min((i - v) ** 2 + (j - u) ** 2, 900.0))
                 cells[WEIGHT, i, j] += weight
                 cells[HEIGHT, i, j] += weight * height[n]
                 cells[CONFIDENCE, i, j] += weight * confidence[n]
                 cells[COUNT, i, j] += 1
-                if np.isnan(lower[n]) or np.isnan(upper[n]):
-                    continue
-                cells[BOUNDED, i, j] += weight
-                cells[LOWER, i, j] += weight * lower[n]
-                cells[UPPER, i, j] += weight * upper[n]
-                cells[LEAST, i, j] = min(cells[LEAST, i, j], lower[n])
-                cells[MOST, i, j] = max(cells[MOST, i, j], upper[n])
-
-
-# What `cell_bounds` takes.
-MEDIAN, NEAREST, AGREEING = range(3)
+                if has_bounds:
+                    cells[BOUNDED, i, j] += 1
+                    cells[LOWER, i, j] = min(cells[LOWER, i, j], lower[n])
+                    cells[UPPER, i, j] = max(cells[UPPER, i, j], upper[n])
 
 
 @cached
-def reaching(column, row, radius, rows, columns):
-    """Return which points reach each cell, by the rule of `splat`.
+def medians(column, row, bound, radius, counts):
+    """Median bound of the points that reach each cell, by the rule of `splat`: ``(rows, columns)``, NaN without any.
 
-    ``rows`` and ``columns`` are the size of the grid. Returns ``starts (rows * columns + 1,)`` and ``points``: those of
-    cell ``i * columns + j`` are ``points[starts[cell] : starts[cell + 1]]``, in their order.
+    column, row, bound: ``(n,)`` of the points with bounds.
+    counts: ``(rows, columns)``, the number of these points that reach each cell, the layer BOUNDED.
     """
-    starts = np.zeros(rows * columns + 1, np.int64)
-    points = np.empty(0, np.int32)
-    reach = max(radius, 0.5)
-    for filling in range(2):
-        for n in range(column.size):
-            u, v = column[n] - 0.5, row[n] - 0.5
-            for i in range(max(0, int(np.ceil(v - reach))), min(rows, int(np.floor(v + reach)) + 1)):
-                for j in range(max(0, int(np.ceil(u - reach))), min(columns, int(np.floor(u + reach)) + 1)):
-                    if (i - v) ** 2 + (j - u) ** 2 > radius**2 and max(abs(i - v), abs(j - u)) > 0.5:
-                        continue
-                    cell = i * columns + j
-                    if filling:
-                        points[starts[cell]] = n
-                    starts[cell + (not filling)] += 1
-        # Loops: `cumsum` and a copy of slices would take seconds longer to compile.
-        if filling:  # each start has moved to the next one
-            for cell in range(starts.size - 1, 0, -1):
-                starts[cell] = starts[cell - 1]
-            starts[0] = 0
-        else:
-            for cell in range(1, starts.size):
-                starts[cell] += starts[cell - 1]
-            points = np.empty(starts[-1], np.int32)
-    return starts, points
-
-
-@cached
-def cell_bounds(starts, points, height, lower, upper, middle, how):
-    """Return bounds of each cell from those of its points, see `reaching`: ``(2, cells)``, NaN without any.
-
-    height, lower, upper: ``(n,)`` of the points, without NaN.
-    middle: ``(cells,)``, the height of each cell.
-    how: MEDIAN of the bounds; bounds of the point NEAREST to the cell's height, the first of several; AGREEING: the
-        intersection of the largest number of intervals that meet, the lowest of several.
-    """
-    bounds = np.full((2, middle.size), np.nan)
-    for cell in range(middle.size):
-        first, last = starts[cell], starts[cell + 1]
-        if first == last:
-            continue
-        if how == NEAREST:
-            best = points[first]
-            for n in points[first + 1 : last]:
-                if abs(height[n] - middle[cell]) < abs(height[best] - middle[cell]):
-                    best = n
-            bounds[0, cell], bounds[1, cell] = lower[best], upper[best]
-            continue
-        count = last - first
-        lows, ups = np.empty(count, lower.dtype), np.empty(count, upper.dtype)
-        for n in range(count):
-            lows[n], ups[n] = lower[points[first + n]], upper[points[first + n]]
-        lows.sort()
-        ups.sort()
-        if how == MEDIAN:
-            bounds[0, cell] = (lows[(count - 1) // 2] + lows[count // 2]) / 2
-            bounds[1, cell] = (ups[(count - 1) // 2] + ups[count // 2]) / 2
-            continue
-        most = ended = 0
-        for begun in range(count):
-            while ups[ended] < lows[begun]:
-                ended += 1
-            if begun + 1 - ended > most:
-                most = begun + 1 - ended
-                bounds[0, cell], bounds[1, cell] = lows[begun], ups[ended]
-    return bounds
+    rows, columns = counts.shape
+    ends = np.empty((rows, columns), np.int64)  # of each cell's bounds in `bounds`, where they are filled in
+    total = 0
+    for i in range(rows):
+        for j in range(columns):
+            ends[i, j] = total
+            total += int(counts[i, j])
+    bounds = np.empty(total, bound.dtype)
+    for n in range(bound.size):
+        u, v = column[n] - 0.5, row[n] - 0.5
+        for i in range(*_around(v, radius, rows)):
+            for j in range(*_around(u, radius, columns)):
+                if _reaches(i - v, j - u, radius):
+                    bounds[ends[i, j]] = bound[n]
+                    ends[i, j] += 1
+    result = np.full((rows, columns), np.nan)
+    for i in range(rows):
+        for j in range(columns):
+            count = int(counts[i, j])
+            if count:
+                own = bounds[ends[i, j] - count : ends[i, j]]
+                own.sort()
+                result[i, j] = (own[(count - 1) // 2] + own[count // 2]) / 2
+    return result

@@ -70,11 +70,11 @@ def waiting_bytes(config: Config, size: int | None = None) -> int:
     return _VIEW_BYTES * side * (side + config.disparity.count) + _CORE_BYTES * size**2
 
 
-def strip_bytes(rows: int, width: int, compression: str) -> int:
+def strip_bytes(rows: int, width: int) -> int:
     """Bytes that finishing a strip of final rows needs on top of its process."""
-    compressed = _BAND_BYTES if compression == "none" else _BAND_BYTES // 2
     piece = _PIECE_BYTES * max(STRIP_PIXELS, _PIECE_ROWS * width)
-    return rows * width * _BAND_BYTES + max(piece, rows * (width * compressed + min(width, _COLUMNS) * _BLOCK_BYTES))
+    bands = rows * width * _BAND_BYTES
+    return bands + max(piece, bands // 2 + rows * min(width, _COLUMNS) * _BLOCK_BYTES)
 
 
 def fitted(config: Config, memory: int, tiles_at_once: int = 1, waiting: int = 0) -> Config:
@@ -90,9 +90,9 @@ def fitted(config: Config, memory: int, tiles_at_once: int = 1, waiting: int = 0
     )
 
 
-def check_strips(rows: int, width: int, config: Config, memory: int, strips_at_once: int = 1) -> None:
+def check_strips(rows: int, width: int, memory: int, strips_at_once: int = 1) -> None:
     """Raise if ``strips_at_once`` strips of final rows do not fit in a process of ``memory`` bytes."""
-    needed = PROCESS_BYTES + strips_at_once * strip_bytes(rows, width, config.products.compression)
+    needed = PROCESS_BYTES + strips_at_once * strip_bytes(rows, width)
     if needed > memory:
         raise ConfigError(
             f"strips of {rows} x {width} pixels, {strips_at_once} at once, need {needed / 1e6:.0f} MB, but "

@@ -1,6 +1,5 @@
 """Read and write GeoTIFF: images, their georeferencing, and the files of a run. Only this folder imports rasterio."""
 
-from sat_intervals.errors import InputError
 from sat_intervals.raster.blocks import BLOCK, codec_versions, compressed, factors
 from sat_intervals.raster.cog import Part
 from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, ranges_file, run_files, surface_file, truth_file
@@ -8,11 +7,11 @@ from sat_intervals.raster.files_of import files_of
 from sat_intervals.raster.frame import Frame, Vertical
 from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing, footprint
 from sat_intervals.raster.heightfield import GROUND, HeightRaster
-from sat_intervals.raster.identity import check_not_replaced, identifiers, identity
+from sat_intervals.raster.identity import check_not_replaced
 from sat_intervals.raster.images import Image, check_pair, describe, open_image
 from sat_intervals.raster.layers import north_up, read_known, read_layers, read_shape, read_tags, write_layer
 from sat_intervals.raster.projection import Projection, geoid_grid, grid_mapping, utm_of
-from sat_intervals.raster.published import is_points_of, is_surface_of, tag_of_left, tags_beside
+from sat_intervals.raster.published import tags_beside
 from sat_intervals.raster.publishing import (
     OutputError,
     check_free,
@@ -44,7 +43,6 @@ __all__ = [
     "Georeferencing",
     "HeightRaster",
     "Image",
-    "InputError",
     "Layer",
     "OutputError",
     "OutputWriter",
@@ -66,11 +64,7 @@ __all__ = [
     "footprint",
     "geoid_grid",
     "grid_mapping",
-    "identifiers",
-    "identity",
-    "is_points_of",
     "is_surface",
-    "is_surface_of",
     "new_file",
     "north_up",
     "open_image",
@@ -89,7 +83,6 @@ __all__ = [
     "resolution_of",
     "run_files",
     "surface_file",
-    "tag_of_left",
     "tags_beside",
     "truth_file",
     "utm_of",

@@ -56,14 +56,13 @@ def template(file: File, place: Georeferencing, tags: Mapping[str, str]) -> byte
     It is made in memory: GDAL says nothing of some failures to write to a disk.
     """
     kind = {"count": len(file.bands), "dtype": file.dtype, "nodata": file.nodata, "sparse_ok": True}
-    predictor = {"PREDICTOR": file.predictor} if file.compression in ("deflate", "zstd") else {}
-    options = {"COMPRESS": file.compression.upper(), "OVERVIEW_RESAMPLING": "NEAREST", "BLOCKSIZE": _SMALL, **predictor}
+    options = {"COMPRESS": file.compression.upper(), "PREDICTOR": file.predictor, "BLOCKSIZE": _SMALL}
     kind |= tiled(file) | {"blockxsize": _SMALL, "blockysize": _SMALL, "height": _SMALL + 1, "width": _SMALL + 1}
     with Env(GDAL_TIFF_ENDIANNESS="LITTLE"), MemoryFile() as small, MemoryFile() as made:
         with gdal.create(small.name, **kind, **place.creation_options()) as dataset:
             dataset.update_tags(**tags)
             file.describe(dataset)
-        copy(small.name, made.name, driver="COG", SPARSE_OK="YES", **options)
+        copy(small.name, made.name, driver="COG", SPARSE_OK="YES", OVERVIEW_RESAMPLING="NEAREST", **options)
         return bytes(made.getbuffer())
 
 

@@ -49,9 +49,8 @@ POINT_FILES = (File("points.tif", "float64", float("nan"), POINTS, predictor="FL
 
 
 def run_files(compression: str) -> tuple[File, File]:
-    """Return the files of a run with a compression of the settings; flags stay as they are with LERC."""
-    flags = "deflate" if compression == "lerc" else compression
-    return replace(INTERVALS, compression=compression), replace(VALIDITY, compression=flags)
+    """Return the files of a run with a compression of the settings."""
+    return replace(INTERVALS, compression=compression), replace(VALIDITY, compression=compression)
 
 
 def surface_file(name: str) -> File:

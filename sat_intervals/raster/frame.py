@@ -24,21 +24,10 @@ class Vertical:
 
 
 class Frame:
-    """The coordinates of a file of heights.
-
-    Parameters
-    ----------
-    name
-        The file, for messages.
-    crs
-        Its CRS: WKT, or what a person gives, such as ``EPSG:2154``; None if it has none.
-    vertical
-        What its heights refer to.
-    level
-        Tag HEIGHTS of a surface model of this tool.
-    """
+    """The coordinates of a file of heights."""
 
     def __init__(self, name: str, crs: str | None, vertical: Vertical, level: str = "") -> None:
+        """``name`` is for messages, ``crs`` WKT or such as EPSG:2154, ``level`` tag HEIGHTS of our surface models."""
         if crs is None:
             raise SatIntervalsError(f"{name} has no CRS: give it with --crs, such as EPSG:32637")
         try:
@@ -51,9 +40,8 @@ class Frame:
                 f"the CRS of {name}, {whole.name}, is a local one: give one of the Earth with --crs"
             )
         self.crs = flat.to_2d()
-        """The CRS without heights."""
+        # metres of a unit of height
         self.unit = whole.axis_info[2].unit_conversion_factor if len(whole.axis_info) > 2 else 1.0
-        """Metres of a unit of height."""
         self._geoid = None if vertical.geoid is None else geoid_grid(vertical.geoid)
         self._grid = vertical.geoid
         if vertical.geoid is None:

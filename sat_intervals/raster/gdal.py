@@ -43,8 +43,6 @@ _STRICT = {
     "GDAL_HTTP_RETRY_DELAY": os.environ.get("GDAL_HTTP_RETRY_DELAY", "1"),  # seconds; doubles each time
     "GDAL_NUM_THREADS": "1",  # a failure in another thread has no message in this one
     "VRT_NUM_THREADS": "1",
-    "GTIFF_DIRECT_IO": "NO",
-    "GTIFF_IGNORE_READ_ERRORS": "NO",
     "GDAL_PNG_WHOLE_IMAGE_OPTIM": "NO",  # reads what is missing from memory that was never written
 }
 _EXTENSIONS = "CPL_VSIL_CURL_ALLOWED_EXTENSIONS"  # often .tif alone, without masks

@@ -25,19 +25,10 @@ _BLOCK, _KEPT = 512, 128
 
 
 class HeightRaster:
-    """The first band of a raster of heights, and where its cells are.
-
-    Parameters
-    ----------
-    path
-        Any raster that GDAL reads by windows; scale and offset of the band are applied.
-    crs
-        Replaces the CRS of the file.
-    vertical
-        What its heights refer to.
-    """
+    """The first band of a raster of heights with its scale and offset, and where its cells are."""
 
     def __init__(self, path: Path, crs: str | None, vertical: Vertical) -> None:
+        """``crs`` replaces the CRS of the file."""
         self._image = open_image(path, band=1)
         place = self._image.georeferencing
         with opened(self._image.path) as dataset:
@@ -53,10 +44,7 @@ class HeightRaster:
             )
         self._to_cells: Affine = ~place.transform
         self.shape = self._image.height, self._image.width
-        """Rows and columns."""
-        a, b, _, d, e, _ = place.transform[:6]
-        self.cell = math.sqrt(abs(a * e - b * d)) * self.frame.metres
-        """Side of a cell in metres, about."""
+        self.cell = math.sqrt(abs(place.transform.determinant)) * self.frame.metres  # side in metres, about
         self._block = lru_cache(_KEPT)(self._read_block)
         if min(self.shape) < 2:
             raise SatIntervalsError(f"{path} has {self.shape[0]} x {self.shape[1]} cells: give at least 2 x 2")

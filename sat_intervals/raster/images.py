@@ -29,39 +29,17 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Image:
-    """One band of a raster file, with all that a worker needs to read any window of it; picklable.
+    """One band of a raster file, with all that a worker needs to read any window of it; picklable."""
 
-    Attributes
-    ----------
-    path
-        Local file (absolute), URL, or any name that GDAL opens.
-    band
-        Counted from 1.
-    height, width
-        Pixels.
-    dtype
-        NumPy name of the file's type.
-    nodata
-        No-data value: the user's, else the file's, else None.
-    use_mask
-        Whether the file has a mask, inside or in a ``.msk`` file.
-    alpha
-        Alpha band, counted from 1, 0 where there is no data; None without one.
-    mask
-        The user's mask: a file of the same size, not 0 where the image must not be used; None without one.
-    georeferencing
-        Georeferencing of the file.
-    """
-
-    path: str
-    band: int
+    path: str  # local file (absolute), URL, or any name that GDAL opens
+    band: int  # counted from 1
     height: int
     width: int
-    dtype: str
-    nodata: float | None
-    use_mask: bool
-    alpha: int | None
-    mask: str | None
+    dtype: str  # NumPy name of the file's type
+    nodata: float | None  # the user's, else the file's
+    use_mask: bool  # whether the file has a mask, inside or in a .msk file
+    alpha: int | None  # band that is 0 where there is no data, counted from 1
+    mask: str | None  # the user's mask: a file of the same size, not 0 where the image must not be used
     georeferencing: Georeferencing
 
 
@@ -95,8 +73,8 @@ def open_image(
     mask = None if mask is None else _absolute(mask)
     with opened(name) as dataset:
         check_listed(name, dataset)
-        bands, alphas = _kinds(dataset)
-        band = _chosen(name, bands, band)
+        alphas = [i for i, kind in enumerate(dataset.colorinterp, start=1) if kind == ColorInterp.alpha]
+        band = _chosen(name, [i for i in dataset.indexes if i not in alphas], band)
         image = Image(
             path=name,
             band=band,
@@ -195,12 +173,6 @@ def _absolute(path: str | os.PathLike[str]) -> str:
     return str(Path(name).absolute()) if os.path.exists(name) else name
 
 
-def _kinds(dataset: DatasetReader) -> tuple[list[int], list[int]]:
-    """Return the numbers of the image bands and of the alpha bands."""
-    alphas = [band for band, kind in enumerate(dataset.colorinterp, start=1) if kind == ColorInterp.alpha]
-    return [band for band in dataset.indexes if band not in alphas], alphas
-
-
 def _chosen(path: str, bands: list[int], band: int | None) -> int:
     """Return the number of the band to match."""
     if not bands:
@@ -216,8 +188,7 @@ def _chosen(path: str, bands: list[int], band: int | None) -> int:
 def _check_mask(image: Image, mask: str) -> None:
     with opened(mask) as dataset:
         check_listed(mask, dataset)
-        if dataset.shape != (image.height, image.width):
-            raise InputError(
-                f"{mask} has {dataset.height} x {dataset.width} pixels, {image.path} {image.height} x {image.width}: "
-                "give a mask of the image's size"
-            )
+        height, width = dataset.shape
+    if (height, width) != (image.height, image.width):
+        sizes = f"{height} x {width} pixels, {image.path} {image.height} x {image.width}"
+        raise InputError(f"{mask} has {sizes}: give a mask of the image's size")

@@ -43,17 +43,10 @@ def grid_mapping(place: Georeferencing) -> dict[str, Any]:
 
 
 class Projection:
-    """Convert points to map coordinates in metres, and heights above the ellipsoid to heights above a geoid.
-
-    Parameters
-    ----------
-    crs
-        A projected CRS in metres, such as ``EPSG:32637``.
-    geoid
-        A grid of geoid heights that PROJ reads (GTX, GeoTIFF); None for heights above the ellipsoid.
-    """
+    """Convert points to map coordinates in metres, and heights above the ellipsoid to heights above a geoid."""
 
     def __init__(self, crs: str, geoid: Path | None = None) -> None:
+        """``crs`` is a projected CRS in metres, ``geoid`` a grid of geoid heights that PROJ reads (GTX, GeoTIFF)."""
         crs = f"EPSG:{crs}" if crs.isdecimal() else crs
         try:
             target = CRS.from_user_input(crs)

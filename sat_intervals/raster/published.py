@@ -5,10 +5,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from sat_intervals.raster.files import POINT_FILES
 from sat_intervals.raster.layers import read_tags
 
-POINTS_FILE = POINT_FILES[0].name
 # Tag of what belongs to a left image.
 _LEFT = "LEFT_SHA256"
 

@@ -100,15 +100,10 @@ def failing(path: Path) -> Iterator[None]:
         if name is not None and Path(name) not in (path, _temporary(path), *path.parents):
             raise
         reason = getattr(error, "strerror", None) or gdal.reason(error)
-        what = f"{reason}: {way_out(error)}"
+        what = f"{reason}: {'choose another name or folder' if isinstance(error, _OF_PATH) else _WAY_OUT}"
         if gdal.is_out_of_memory(error):
             what = f"not enough memory ({gdal.reason(error)}): give the process more memory"
         raise OutputError(f"{path} cannot be written: {what}") from error
-
-
-def way_out(error: BaseException) -> str:
-    """Return what to do about an error of writing."""
-    return "choose another name or folder" if isinstance(error, _OF_PATH) else _WAY_OUT
 
 
 def _temporary(path: Path) -> Path:
@@ -143,8 +138,7 @@ def pixel_bytes(files: Sequence[File]) -> int:
 
 def file_bytes(files: Sequence[File], height: int, width: int) -> int:
     """Return the size of files with their overviews, at most."""
-    share = sum(pixel_bytes([file]) * (1 if file.compression == "none" else _SHARE) for file in files)
-    return round(height * width * share * 4 / 3)
+    return round(height * width * pixel_bytes(files) * _SHARE * 4 / 3)
 
 
 def part_bytes(files: Sequence[File], height: int, width: int) -> int:

@@ -92,18 +92,9 @@ def covered_window(path: Path, place: Georeferencing, shape: tuple[int, int]) ->
 def read_heights(
     path: Path, place: Georeferencing, shape: tuple[int, int], window: Window, *, smooth: bool = False
 ) -> np.ndarray:
-    """Read the first band of a raster at the centres of cells, NaN where it has no value.
+    """Read the first band of a raster at the centres of the cells in a window of a grid; NaN where it has no value.
 
-    Parameters
-    ----------
-    path
-        Any raster with a CRS; its mask, no-data value, scale and offset are applied.
-    place, shape
-        Georeferencing and size of the grid of cells.
-    window
-        The cells to read.
-    smooth
-        Whether to interpolate bilinearly; otherwise the nearest pixel is used.
+    Its mask, no-data value, scale and offset are applied; ``smooth`` interpolates, otherwise the nearest pixel is used.
     """
     height, width = shape
     grid = {"crs": place.crs, "transform": place.transform, "height": height, "width": width}

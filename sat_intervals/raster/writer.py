@@ -20,31 +20,11 @@ from sat_intervals.raster.streaming import Stream
 
 
 class OutputWriter:
-    """Write files from full-width strips of rows in increasing order, or from parts that were made elsewhere.
-
-    ::
-
-        with OutputWriter(folder, RUN_FILES, height, width, georeferencing, tags) as writer:
-            writer.write(row, intervals, validity)  # strip by strip
-            writer.publish()
+    """Write files of a folder from full-width strips in increasing order, or from parts that were made elsewhere.
 
     Memory depends on the strip, but pictures (PNG) are kept in it. Until `publish` all files have temporary names, see
     `new_file`; leaving the context removes these. All methods raise `OutputError` with the name of the final file.
-
-    Parameters
-    ----------
-    folder
-        Output folder; created if missing.
-    files
-        The files to write.
-    height, width
-        Pixels.
-    georeferencing
-        Georeferencing of the pixels written.
-    tags
-        Metadata of all files.
-    threads
-        Threads for compression; None for one per core.
+    ``threads`` compress, None for one per core.
     """
 
     def __init__(

@@ -4,10 +4,11 @@ import filecmp
 import json
 import logging
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing, contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -29,9 +30,8 @@ from sat_intervals.run.strips import (
     parts_of,
     rows_of_levels,
 )
-from sat_intervals.run.workers import Task, Threads, Workers, picklable_errors, reason
+from sat_intervals.run.workers import Task, Threads, Workers, picklable_errors, reason, results
 from sat_intervals.store.arrays import DamagedFileError
-from sat_intervals.store.folder import folder_at
 from sat_intervals.store.tiles import COSTS, FAILURES, PARTS, PIXELS, Tables, home_of
 
 _THREADS = 2  # that copy parts which workers cannot copy: one reads while another writes
@@ -39,54 +39,34 @@ _THREADS = 2  # that copy parts which workers cannot copy: one reads while anoth
 _LOG = logging.getLogger(__name__)
 
 
-def assemble(
-    job: Job,
-    client: Callable[[], Workers],
-    seconds: dict[str, float],
-    progress: Progress,
-    *,
-    overwrite: bool,
-    keep_tiles: bool,
-) -> dict[str, Any]:
+def assemble(job: Job, workers: Workers, seconds: dict[str, float], progress: Progress) -> dict[str, Any]:
     """Write and publish the files of a run whose tiles are done; return the content of ``run.json``."""
     region, tables = job.store.grid.region, job.store.tables()
     scale = scale_of(job, tables)
     with logged_stage(seconds, "bands"):
-        parts = finish_strips(job, client, scale, progress)
+        parts = finish_strips(job, workers, scale, progress)
     files, place = run_files(job.config.products.compression), job.left.georeferencing.shifted(region)
     with (
-        _resumable(),
+        _resumable(job),
         OutputWriter(job.out, files, region.height, region.width, place, tags_of(job.config)) as writer,
     ):
         with logged_stage(seconds, "files"):
-            _copy_parts(job, writer, parts, client, progress)
+            _copy_parts(job, writer, parts, workers, progress)
             made = writer.build()
         with logged_stage(seconds, "inputs"):
-            _check_inputs(job)
+            check_unchanged(job.inputs, job.left, job.right, job.config)
         report = report_of(job, tables, scale, parts.values(), seconds)
         for line in report["warnings"]:
             _LOG.warning("%s", line)
-        _publish(job, writer, made, report, overwrite=overwrite)
-    end_tiles(job, keep_tiles=keep_tiles)
+        _publish(job, writer, made, report)
     return report
 
 
-def _check_inputs(job: Job) -> None:
-    """Compare the inputs with those of the start; if one differs, the tiles are of both and must go."""
-    try:
-        check_unchanged(job.inputs, job.left, job.right, job.config)
-    except ChangedInputError:
-        remove_tiles(job.out)
-        raise
-
-
-def _publish(
-    job: Job, writer: OutputWriter, made: Mapping[str, Path], report: dict[str, Any], *, overwrite: bool
-) -> None:
-    """Give the files their names, ``run.json`` last; files that are there must be the same, unless ``overwrite``."""
+def _publish(job: Job, writer: OutputWriter, made: Mapping[str, Path], report: dict[str, Any]) -> None:
+    """Give the files their names, ``run.json`` last; files that are there must be the same, or may be replaced."""
     for name, new in made.items():
         there = job.out / name
-        if not overwrite and there.exists() and not filecmp.cmp(there, new, shallow=False):
+        if not job.overwrite and there.exists() and not filecmp.cmp(there, new, shallow=False):
             raise SatIntervalsError(f"{there} is not of this run: move it away or give --overwrite; the tiles are kept")
     with new_file(job.out / RUN_REPORT) as new:  # gets its name last
         new.write_bytes((json.dumps(report, indent=1) + "\n").encode())
@@ -97,72 +77,61 @@ def _publish(
 def end_tiles(job: Job, *, keep_tiles: bool) -> None:
     """Remove the tiles of a complete run, or what is beside them if they are kept."""
     try:
-        if keep_tiles:
-            job.store.remove([PIXELS, COSTS, PARTS, FAILURES])
-        else:
+        if not keep_tiles:
             remove_tiles(job.out)
+        elif home_of(job.out).exists():
+            job.store.remove([PIXELS, COSTS, PARTS, FAILURES])
     except OSError as error:  # the run is complete
         _LOG.warning("tiles of the complete run stay: %s", reason(error))
 
 
 @contextmanager
-def _resumable() -> Iterator[None]:
-    """Turn an OutputError into a RunError: all tiles are done, so the run can be resumed."""
+def _resumable(job: Job) -> Iterator[None]:
+    """Turn an OutputError into a RunError, since the run can be resumed; delete tiles of inputs that have changed."""
     try:
         yield
+    except ChangedInputError:
+        remove_tiles(job.out)
+        raise
     except OutputError as error:
         raise RunError(f"{error}; rerun the same command: it resumes from the tiles, which are all done") from error
 
 
 # ---- Parts -------------------------------------------------------------------------------------------------
 def _copy_parts(
-    job: Job,
-    writer: OutputWriter,
-    metas: Mapping[PartKey, Mapping[str, Any]],
-    client: Callable[[], Workers],
-    progress: Progress,
+    job: Job, writer: OutputWriter, metas: Mapping[PartKey, Mapping[str, Any]], workers: Workers, progress: Progress
 ) -> None:
     """Copy the finished parts of a run into its files, on workers that share its folder, else in this process."""
     files, of = run_files(job.config.products.compression), parts_of(job)
-    done, total, damaged = 0, len(files) * len(metas), list[str]()
-    with _copiers(job, client) as copiers:
+    copied, total, retries = list[str | None](), len(files) * len(metas), job.config.cluster.retries
+    with nullcontext(workers) if job.is_home else closing(Threads(_THREADS)) as copiers:
 
         def copy_parts(path: Path, parts: Iterable[tuple[int, Part]]) -> None:
-            nonlocal done
-            retries = job.config.cluster.retries
             tasks = (
                 Task(part.source, copy_part, (job, of, *part.source, path.absolute(), offset), retries)
                 for offset, part in parts
             )
-            for outcome in copiers.outcomes(tasks):
-                if outcome is not None and outcome.error is not None:
-                    if isinstance(outcome.error, (OSError, SatIntervalsError)):
-                        raise outcome.error
-                    raise RunError(f"a part of {path} could not be copied: {reason(outcome.error)}") from outcome.error
-                if outcome is not None:
-                    done += 1
-                    damaged.extend(filter(None, [outcome.result]))
-                progress("files", done, total)
+            for _, name in results(copiers, tasks, partial(_fail, path), look):
+                copied.append(name)
 
-        progress("files", 0, total)
+        def look(_: int) -> None:
+            progress("files", len(copied), total)
+
+        look(0)
         for file in files:
             levels = [
                 [Part(metas[level, row]["blocks"][file.kind], ((level, row), file.kind)) for row in range(count)]
                 for level, count in enumerate(rows_of_levels(job.store.grid.region))
             ]
             writer.assemble(file.name, levels, copy_parts)
-    if damaged:
-        raise damaged_parts(job, sorted(set(damaged)))
+    if damaged := sorted({name for name in copied if name}):
+        raise damaged_parts(job, damaged)
 
 
-@contextmanager
-def _copiers(job: Job, client: Callable[[], Workers]) -> Iterator[Workers]:
-    """Yield the workers if they reach the folder of the run, else threads of this process."""
-    if job.store.folder == folder_at(home_of(job.out)):
-        yield client()
-    else:
-        with closing(Threads(_THREADS)) as threads:
-            yield threads
+def _fail(path: Path, _: object, error: BaseException) -> NoReturn:
+    if isinstance(error, (OSError, SatIntervalsError)):
+        raise error
+    raise RunError(f"a part of {path} could not be copied: {reason(error)}") from error
 
 
 def copy_part(job: Job, of: str, key: PartKey, kind: str, path: Path, offset: int) -> str | None:

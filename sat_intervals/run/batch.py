@@ -13,23 +13,25 @@ from typing import Any
 
 from sat_intervals.config import Config, load_config, named_files, read_yaml
 from sat_intervals.config.pairs import REPORT, PairOfBatch
+from sat_intervals.config.presets import merged
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, OutputError, files_of, open_image
-from sat_intervals.raster.identity import check_not_replaced, identifiers
+from sat_intervals.raster.identity import check_not_replaced
 from sat_intervals.raster.publishing import write_file
+from sat_intervals.run.assemble import end_tiles
 from sat_intervals.run.connection import Connection
 from sat_intervals.run.job import Job, Search, prepare
 from sat_intervals.run.pair import (
     Matched,
     check_failures,
     complete_before,
-    find_on,
     match_and_assemble,
     match_jobs,
     measure_images,
 )
+from sat_intervals.run.search_range import search_range
 from sat_intervals.run.state import OUTPUTS
 from sat_intervals.run.status import read_report
 from sat_intervals.run.workers import Workers
@@ -68,28 +70,30 @@ def match_batch(
         report = _Report(out)
         report.note({pair.name: {"state": "waiting"} for pair in pairs})
         with Connection(common.cluster, out) as connection:
-            find = partial(find_on, connection, {}, progress)
+            find = partial(search_range, connection, progress=progress)
             jobs: dict[str, Job] = {}
             for number, pair in enumerate(pairs):
                 progress("pairs", number, len(pairs))
                 try:
-                    own = {**(overrides or {}), **_merged(overrides or {}, pair.settings)}
+                    own = merged(overrides or {}, pair.settings)
                     settings = load_config(sections, own, preset_wins=True, file=file)
                     job = _prepared(pair, out, settings, overwrite=overwrite, find=find)
                     stack.enter_context(locked(job.out))
-                    if job.begin(overwrite=overwrite):
+                    if job.begin():
                         jobs[pair.name] = job
                     else:
-                        before = complete_before(job, keep_tiles=keep_tiles)
+                        before = complete_before(job)
+                        end_tiles(job, keep_tiles=keep_tiles)
                         report.note({pair.name: {"state": "done before"} | {key: before[key] for key in _KEPT}})
                 except Exception as error:  # one pair's failure must not stop the others
                     report.note({pair.name: _failed(error)})
             progress("pairs", len(pairs), len(pairs))
-            for name, how in _matched(jobs, connection, progress, overwrite=overwrite, keep_tiles=keep_tiles):
+            for name, how in _matched(jobs, connection, progress, keep_tiles=keep_tiles):
                 report.note({name: how})
         for pair in pairs:
-            if (how := _finished(pair, report.states[pair.name], finish)) is not report.states[pair.name]:
-                report.note({pair.name: how})
+            how = report.states[pair.name]
+            if how["state"] != "failed" and (more := _more(pair, how["finished"], finish)):
+                report.note({pair.name: {**how, **more}})
     return report.states
 
 
@@ -113,17 +117,13 @@ class _Report:
 
 
 def _check_not_replaced(pairs: Sequence[PairOfBatch], others: Sequence[str | Path | None], out: Path) -> None:
-    """Raise if an input of any pair, or another file that is read, is an output of any pair, or two pairs share one."""
-    folders: dict[object, Path] = {}
-    for folder in (out / pair.name for pair in pairs):
-        for found in identifiers(folder):
-            if (other := folders.setdefault(found, folder)) != folder:
-                raise SatIntervalsError(f"{other} and {folder} are the same folder: remove the link")
+    """Raise if an input of any pair, or another file that is read, is an output of any pair."""
+    folders = [out / pair.name for pair in pairs]
     images = [name for pair in pairs for name in (pair.left, pair.right, pair.left_mask, pair.right_mask)]
     named = [name for pair in pairs for name in (*(pair.sensors or ()), *named_files(pair.settings))]
     read = [file for name in {str(name) for name in (*others, *images, *named) if name} for file in _files(name)]
-    outputs = [out / REPORT, *(folder / name for folder in folders.values() for name in OUTPUTS)]
-    check_not_replaced(read, outputs, [folder / "tiles" for folder in folders.values()])
+    outputs = [out / REPORT, *(folder / name for folder in folders for name in OUTPUTS)]
+    check_not_replaced(read, outputs, [folder / "tiles" for folder in folders])
 
 
 def _files(name: str) -> list[str]:
@@ -149,15 +149,12 @@ def _failed(error: Exception) -> dict[str, Any]:
     return {"state": "failed", "error": str(error) or type(error).__name__}
 
 
-def _finished(pair: PairOfBatch, how: dict[str, Any], finish: Finish) -> dict[str, Any]:
-    """Return the state of a pair after its last step."""
-    if how["state"] == "failed":
-        return how
+def _more(pair: PairOfBatch, finished: str, finish: Finish) -> Mapping[str, Any]:
+    """Return what the last step of a pair adds to its state."""
     try:
-        more = finish(pair, how["finished"])
-        return {**how, **more} if more else how
+        return finish(pair, finished)
     except Exception as error:  # one pair's failure must not stop the others
-        return {**how, **_failed(error)}
+        return _failed(error)
 
 
 def _raise_file_limit() -> None:
@@ -168,34 +165,26 @@ def _raise_file_limit() -> None:
             resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
 
 
-def _merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the sections of both; the second wins, key by key."""
-    return {
-        name: {**first[name], **section} if name in first and isinstance(section, Mapping) else section
-        for name, section in second.items()
-    }
-
-
 def _matched(
-    jobs: Mapping[str, Job], connection: Connection, progress: Progress, *, overwrite: bool, keep_tiles: bool
+    jobs: Mapping[str, Job], workers: Workers, progress: Progress, *, keep_tiles: bool
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """Match the tiles of all jobs; assemble finished jobs in a thread meanwhile."""
     if not jobs:
         return
-    for config in {_kernels(job.config): job.config for job in jobs.values()}.values():
-        compile_kernels(config)
+    for job in jobs.values():
+        compile_kernels(job.config)
     assembling: dict[Future[dict[str, Any]], str] = {}
     with _thread() as (thread, check):
-        client, measured = connection.client(), {}
+        measured = {}
         for name, job in jobs.items():
             try:
-                measure_images(client, job, progress)
+                measure_images(workers, job, progress)
                 measured[name] = job
             except Exception as error:  # one pair's failure must not stop the others
                 yield name, _failed(error)
         names = {id(job): name for name, job in measured.items()}
-        assembled = partial(_assembled, client, check, overwrite=overwrite, keep_tiles=keep_tiles)
-        for matched in match_jobs(client, list(measured.values()), progress):
+        assembled = partial(_assembled, workers, check, keep_tiles=keep_tiles)
+        for matched in match_jobs(workers, list(measured.values()), progress):
             assembling[thread.submit(assembled, matched)] = names[id(matched.job)]
             for future in [future for future in assembling if future.done()]:
                 yield assembling.pop(future), future.result()
@@ -224,19 +213,12 @@ def _thread() -> Iterator[tuple[ThreadPoolExecutor, Progress]]:
             raise
 
 
-def _kernels(config: Config) -> str:
-    """Return a key of the kernels that a configuration needs."""
-    search, sgm, cross_check = config.disparity, config.sgm, config.cross_check
-    return repr((config.cost, search.local, search.grid, sgm and sgm.penalty, cross_check and cross_check.method))
-
-
-def _assembled(
-    client: Workers, progress: Progress, matched: Matched, *, overwrite: bool, keep_tiles: bool
-) -> dict[str, Any]:
+def _assembled(workers: Workers, progress: Progress, matched: Matched, *, keep_tiles: bool) -> dict[str, Any]:
     job, failures, seconds = matched
     try:
         check_failures(job, failures)
-        report = match_and_assemble(job, lambda: client, seconds, progress, overwrite=overwrite, keep_tiles=keep_tiles)
+        report = match_and_assemble(job, workers, seconds, progress)
+        end_tiles(job, keep_tiles=keep_tiles)
     except Exception as error:  # one pair's failure must not stop the others
         return _failed(error)
     return {"state": "done", **{name: report[name] for name in _KEPT}}

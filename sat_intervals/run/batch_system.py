@@ -40,13 +40,16 @@ def batch_system(settings: Cluster, logs: Path) -> Any:
 
 def _given(settings: Cluster, own_logs: str | None, logs: Path) -> dict[str, Any]:
     """Return the arguments for dask-jobqueue; they win over the user's dask configuration."""
+    walltime = settings.walltime
+    if walltime and settings.kind == "lsf":
+        walltime = ":".join(walltime.split(":")[:2])  # without seconds
     options = {
         "queue": settings.queue,
         "project" if settings.kind in _CHARGE_PROJECTS else "account": settings.account,
         "cores": settings.cores,
         "processes": 1,
         "memory": settings.memory,
-        "walltime": _without_seconds(settings.walltime) if settings.kind == "lsf" else settings.walltime,
+        "walltime": walltime,
         "job_extra_directives": settings.directives,
     }
     if settings.memory is None and dask.config.get(f"jobqueue.{settings.kind}.memory", None) is None:
@@ -86,11 +89,6 @@ def _job_class(base: Any, submitted: set[str], refusals: list[str]) -> type:
     return Job
 
 
-def _without_seconds(walltime: str | None) -> str | None:
-    """Return hours and minutes, the format of LSF."""
-    return ":".join(walltime.split(":")[:2]) if walltime else None
-
-
 def job_script(settings: Cluster, out: Path) -> str:
     """Return the script of one job of a batch system, without submitting it."""
     if settings.kind in ("threads", "processes", "address"):
@@ -102,16 +100,3 @@ def job_script(settings: Cluster, out: Path) -> str:
         with suppress(OSError):
             folder.rmdir()
     return script
-
-
-def check_accepted(cluster: Any) -> None:
-    """Raise if the batch system refused all jobs."""
-    if getattr(cluster, "refusals", None) and not cluster.submitted:
-        raise SatIntervalsError(
-            f"the batch system refuses the job: {' '.join(cluster.refusals[0].split())}: check the section cluster"
-        )
-
-
-def logs_of(cluster: Any) -> str:
-    """Return where jobs write their logs, as the end of a message; empty for other clusters."""
-    return f": see the queue, and the logs of the jobs in {cluster.logged}" if hasattr(cluster, "logged") else ""

@@ -12,10 +12,8 @@ from sat_intervals.raster import Image, describe
 from sat_intervals.raster.identity import identity
 from sat_intervals.store.manifest import differences
 
-_Identities = Mapping[str, Mapping[str, Any]]
 
-
-def describe_inputs(left: Image, right: Image, config: Config, known: _Identities) -> dict[str, Any]:
+def describe_inputs(left: Image, right: Image, config: Config, known: Mapping[str, Any]) -> dict[str, Any]:
     """Return what identifies images and weights; see `identity` for ``known``."""
     inputs = {"left": describe(left, known), "right": describe(right, known)}
     if isinstance(config.cost, Mccnn):

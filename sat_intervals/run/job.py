@@ -1,6 +1,7 @@
 """Prepare a pair for matching: images, search range, inputs, tiles, and the state of its folder."""
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.metadata import version
@@ -40,6 +41,7 @@ Search = Callable[[Image, Image], Found]
 _NOT_OF_TILES = {"preset", "median", "regularization", "products", "cluster"}
 # Files of `ONCE`.
 _STATISTICS, _RANGE = "statistics", "range"
+_REMOTE = "check URL and credentials, and pip install the package of its file system ('sat-intervals[remote]' for S3)"
 _NO_TILES = Grid(Window(0, 0, 0, 0), 1)
 
 
@@ -48,7 +50,8 @@ class Job:
     """All that is needed to match any tile of a pair and to assemble its files; picklable.
 
     ``requested`` is the section ``disparity`` as given, ``found`` the result of the search for a range, ``local`` the
-    local ranges, which workers read from the store. `calibrate` makes no files of its tiles: ``has_files`` is False.
+    local ranges, which workers read from the store. With ``overwrite``, files and another run in ``out`` may be
+    replaced. `calibrate` makes no files of its tiles: ``has_files`` is False.
     """
 
     left: Image
@@ -61,14 +64,19 @@ class Job:
     found: Found | None = None
     ranges_digest: str | None = None
     local: LocalRanges | None = None
+    overwrite: bool = False
     has_files: bool = True
 
     @property
     def manifest(self) -> dict[str, Any]:
         """Return all that decides the bytes of a tile, and where the tiles are."""
         made = _manifest(self.config, self.inputs, self.store.grid.region, self.ranges_digest)
-        is_home = self.store.folder == folder_at(home_of(self.out))
-        return made | {PLACE: None if is_home else str(self.store.folder)}
+        return made | {PLACE: None if self.is_home else str(self.store.folder)}
+
+    @property
+    def is_home(self) -> bool:
+        """Return whether the tiles are in the folder of the run."""
+        return self.store.folder == folder_at(home_of(self.out))
 
     @property
     def hands_states_on(self) -> bool:
@@ -90,9 +98,9 @@ class Job:
         """Return the settings that decide the bytes of the files."""
         return self.config.model_dump(mode="json", exclude={"cluster", "preset"})
 
-    def begin(self, *, overwrite: bool = False) -> bool:
+    def begin(self) -> bool:
         """Open the store and return True; False if the run is complete. Call it while the folder is locked."""
-        step = next_step(self.out, self.manifest, self.name, self.settings, overwrite=overwrite)
+        step = next_step(self.out, self.manifest, self.name, self.settings, overwrite=self.overwrite)
         if step == "complete":
             return False
         if step == "start anew":
@@ -105,7 +113,8 @@ class Job:
                 found, ranges = self.found and self.found.report(), self.local and self.local.report()
                 self.store.write(ONCE, _RANGE, of=origin_of(self.inputs), found=found, ranges=ranges)
         except OSError as error:
-            raise _unusable(self.store, error) from error
+            way_out = "make room, check its rights or choose another folder" if self.store.folder.is_local else _REMOTE
+            raise StoreError(f"{self.store.folder} cannot be used: {error.strerror or error}: {way_out}") from error
         self._check_space()
         return True
 
@@ -120,7 +129,7 @@ class Job:
         parts = self.has_files * part_bytes(files, region.height, region.width)
         before = share * (tiles + handed) + max(0, parts - sum(self.store.folder.sizes(PARTS).values()))
         final = self.has_files * file_bytes(files, region.height, region.width)
-        if self.store.folder == folder_at(home_of(self.out)):
+        if self.is_home:
             check_space(self.out, round(before + final), "tiles, files and their parts")
             return
         check_space(self.out, final, "files")
@@ -194,7 +203,9 @@ def prepare(
     if not config.disparity.is_auto:
         check_tiles(fitted_to_jobs(config), region)
     check_folder(out, overwrite=overwrite)
-    before = _before(out)
+    before: dict[str, Any] = {}  # manifest or report of an earlier run
+    with suppress(StoreError):
+        before = read_manifest(home_of(out)) or read_report(out) or {}
     inputs = describe_inputs(left, right, config, identities(before.get("inputs", {})))
     config, found, local = searched(config, left, lambda: _found(out, before, inputs, find, left, right))
     checked_pair(left, right, config)
@@ -207,15 +218,7 @@ def prepare(
     folder = folder_at(f"{folder_at(store)}/{'-'.join(filter(None, (pair, run)))}" if store else home_of(out))
     kept = Store(folder, Grid(region, config.tiles.size), run)
     check_not_replaced(read, [out / name for name in OUTPUTS], [home_of(out)])
-    return Job(left, right, config, kept, out, inputs, requested, found, ranges, local)
-
-
-def _before(out: Path) -> dict[str, Any]:
-    """Return the manifest of an earlier run in a folder, or its report; empty without both."""
-    try:
-        return read_manifest(home_of(out)) or read_report(out) or {}
-    except StoreError:
-        return {}
+    return Job(left, right, config, kept, out, inputs, requested, found, ranges, local, overwrite)
 
 
 def _found(
@@ -244,24 +247,12 @@ def origin_of(inputs: Mapping[str, Any]) -> str:
 def remove_tiles(out: Path) -> None:
     """Delete the tiles of the run in a folder, wherever they are, the manifest last."""
     home = home_of(out)
-    try:
-        manifest = read_manifest(home)
-    except StoreError:
-        manifest = None
-    if manifest:
-        Store(place_of(home, manifest), _NO_TILES, "").remove()
+    with suppress(StoreError):
+        if manifest := read_manifest(home):
+            Store(place_of(home, manifest), _NO_TILES, "").remove()
     Store(folder_at(home), _NO_TILES, "").remove()
     (home / MANIFEST).unlink(missing_ok=True)
     folder_at(home).remove_if_empty()
-
-
-def _unusable(store: Store, error: OSError) -> StoreError:
-    """Return the error for a store that cannot be written."""
-    remote = (
-        "check URL and credentials, and pip install the package of its file system ('sat-intervals[remote]' for S3)"
-    )
-    way_out = "make room, check its rights or choose another folder" if store.folder.is_local else remote
-    return StoreError(f"{store.folder} cannot be used: {error.strerror or error}: {way_out}")
 
 
 _version = cache(lambda: version("sat-intervals"))  # reading it takes 2 ms, and each tile compares manifests

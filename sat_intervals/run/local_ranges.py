@@ -24,31 +24,24 @@ from sat_intervals.tiling import Window
 
 # Side of the cells that a raster of ranges is reduced to, in pixels, and rows that are written at a time.
 _CELL, _STRIP = 64, 256
-# Tag of the rasters of `write_ranges`: the image.
-_OF = "RANGES_OF"
 
 
 def searched(config: Config, left: Image, find: Callable[[], Found]) -> tuple[Config, Found | None, LocalRanges | None]:
     """Return settings with the search range as numbers, what ``find`` found if needed, and local ranges, if any."""
-    search = config.disparity
-    raster = read_ranges(search.grid, left) if search.grid else None
+    search, found, local = config.disparity, None, None
     if search.grid:
         tags_beside(search.grid, identity(left.path))
-    found = None
-    if raster is None and (search.is_auto or search.local):
+        local = read_ranges(search.grid, left)
+        config = _with_range_of(config, local) if search.is_auto else config
+    elif search.is_auto or search.local:
         found = find()
-    if search.is_auto:
-        config = with_range(config, found) if found else _with_range_of(config, raster)
-    if not search.is_local:
-        return config, found, None
-    local = raster if raster else found.local if found else None
-    assert local is not None
-    return config, found, local.clipped(config.disparity.minimum, config.disparity.maximum)
+        local = found.local if search.local else None
+        config = with_range(config, found) if search.is_auto else config
+    return config, found, local and local.clipped(config.disparity.minimum, config.disparity.maximum)
 
 
-def _with_range_of(config: Config, raster: LocalRanges | None) -> Config:
+def _with_range_of(config: Config, raster: LocalRanges) -> Config:
     """Return settings with the hull of a raster of ranges as search range."""
-    assert raster is not None
     known = raster.minimum <= raster.maximum
     if not known.any():
         raise SatIntervalsError(f"{config.disparity.grid} has no data: give another raster, or the search range")
@@ -58,8 +51,8 @@ def _with_range_of(config: Config, raster: LocalRanges | None) -> Config:
 
 def write_ranges(path: Path, ranges: LocalRanges, left: Image) -> None:
     """Write local ranges as `read_ranges` reads them: minimum and maximum of each pixel of the left image."""
-    shape, tags = (left.height, left.width), {_OF: left.path, **tag_of_left(identity(left.path))}
-    tags["SOFTWARE"] = "sat-intervals"
+    shape, tags = (left.height, left.width), tag_of_left(identity(left.path))
+    tags |= {"RANGES_OF": left.path, "SOFTWARE": "sat-intervals"}
     with OutputWriter(path.parent, [ranges_file(path.name)], *shape, left.georeferencing, tags) as writer:
         for row in range(0, left.height, _STRIP):
             window = Window(row, 0, min(_STRIP, left.height - row), left.width)

@@ -31,7 +31,7 @@ from sat_intervals.products import INVALID
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, Layer, open_image
 from sat_intervals.run.assemble import scale_of
-from sat_intervals.run.connection import connected
+from sat_intervals.run.connection import Connection
 from sat_intervals.run.inputs import check_unchanged
 from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.pair import check_failures, match_jobs, measure_images
@@ -90,11 +90,11 @@ def measure_subjects(
     found: list[Measured] = []
     key, levels = key_of(subjects[0].config), ladder(subjects[0].config)
     compile_kernels(_at_levels(subjects[0].config, 0.0, 0.0, QUANTILES[-1]))
-    with _scratch(folder) as scratch, connected(subjects[0].config.cluster, scratch) as client:
+    with _scratch(folder) as scratch, Connection(subjects[0].config.cluster, scratch) as workers:
         for number, subject in enumerate(subjects):
             one = progress if len(subjects) == 1 else partial(_of_all, progress, "subjects", number, len(subjects))
             one("subjects", 0, 1)
-            found += _of_subject(client, subject, levels, scratch / str(number), len(subjects) == 1, one)
+            found += _of_subject(workers, subject, levels, scratch / str(number), len(subjects) == 1, one)
     progress("subjects", len(subjects), len(subjects))
     check_enough(sum(part.kept for part in found), subjects, "kept pixels have a truth")
     return found, key
@@ -119,7 +119,7 @@ def _of_all(progress: Progress, stage: str, number: int, total: int, *_: object)
 
 
 def _of_subject(
-    client: Workers, subject: Subject, levels: np.ndarray, folder: Path, in_blocks: bool, progress: Progress
+    workers: Workers, subject: Subject, levels: np.ndarray, folder: Path, in_blocks: bool, progress: Progress
 ) -> list[Measured]:
     """Match a subject, with two levels of the ladder at a time, and measure it."""
     gauge: _Gauge | None = None
@@ -134,8 +134,8 @@ def _of_subject(
             if in_blocks and len(batches) > 1:  # stages of each batch would begin again
                 step = partial(_of_all, progress, "levels", number, len(batches))
             for job in batch:
-                measure_images(client, job, step)
-            for matched in match_jobs(client, batch, step):
+                measure_images(workers, job, step)
+            for matched in match_jobs(workers, batch, step):
                 job = matched.job
                 check_failures(job, matched.failures)
                 gauge = gauge or _Gauge(job, subject, levels.size, in_blocks)
@@ -219,7 +219,9 @@ class _Gauge:
                 assert rows.low is not None  # checked
                 disparity, kept = rows.disparity[inner], rows.validity[inner] & INVALID == 0
                 if rung + cut == 0:
-                    self._count(truth, np.where(kept, disparity, np.nan), parts)
+                    known = np.isfinite(truth)
+                    for counts, chosen in ((self._known, known), (self._good, kept & (abs(disparity - truth) <= 1))):
+                        counts += np.bincount(parts[chosen], minlength=counts.size)
                 kept &= np.isfinite(truth)
                 low, high = kept & rows.low[inner], kept & ~rows.low[inner]
                 for scheme, quantile in enumerate((None, *QUANTILES)):
@@ -231,12 +233,6 @@ class _Gauge:
                     lower, upper = widened(lower, upper, middle, config)
                     tolerance, number = self._subject.tolerance, len(self._tables)
                     self._tables[:, rung + cut, scheme] += measure(lower, upper, true, tolerance, part, number)
-
-    def _count(self, truth: np.ndarray, disparity: np.ndarray, parts: np.ndarray) -> None:
-        known = np.isfinite(truth)
-        good = known & (np.abs(disparity - truth) <= 1)
-        for counts, chosen in ((self._known, known), (self._good, good)):
-            counts += np.bincount(parts[chosen], minlength=counts.size)
 
 
 def _strips(job: Job) -> Iterator[tuple[int, RawRows, int, int, ConfidenceScale]]:

@@ -1,15 +1,14 @@
 """Match a pair, files to files, with steps shared with batches: measure images, match tiles, repair damaged ones."""
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 from sat_intervals.config import load_config
 from sat_intervals.errors import RunError
-from sat_intervals.match.normalization import ImageStatistics, Moments, PairStatistics, blocks, statistics_of
+from sat_intervals.match.normalization import ImageStatistics, PairStatistics, blocks, statistics_of
 from sat_intervals.match.schedule import Schedule
 from sat_intervals.match.search_range import Found
 from sat_intervals.match.warm_up import compile_kernels
@@ -21,9 +20,9 @@ from sat_intervals.run.connection import Connection
 from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.search_range import search_range
 from sat_intervals.run.tile import match_block, measure_block, trace_block
-from sat_intervals.run.workers import Task, Workers, check_not_full, reason
+from sat_intervals.run.workers import Task, Workers, check_not_full, reason, results
 from sat_intervals.store.lock import locked
-from sat_intervals.store.tiles import BORDERS, COSTS, FAILURES, PIXELS, DamagedTilesError, home_of
+from sat_intervals.store.tiles import BORDERS, COSTS, FAILURES, PIXELS, DamagedTilesError
 from sat_intervals.tiling import Tile, Window
 
 _TRIES = 2  # matches of damaged tiles; more damage means a broken disk
@@ -76,50 +75,44 @@ def match_pair(
     """
     config, out, seconds = load_config(config), Path(out), dict[str, float]()
     with Connection(config.cluster, out) as connection:
-        find = partial(find_on, connection, seconds, progress)
+
+        def find(left: Image, right: Image) -> Found:
+            with logged_stage(seconds, "start.range"):
+                return search_range(connection, left, right, progress)
+
         with logged_stage(seconds, "start"):
             job = prepare(left, right, out, config, window=window, overwrite=overwrite, find=find)
         with locked(out):
-            if not job.begin(overwrite=overwrite):
-                return complete_before(job, keep_tiles=keep_tiles)
-            with logged_stage(seconds, "kernels"):
-                progress("kernels", 0, 1)
-                compile_kernels(job.config, hands_states_on=job.hands_states_on)
-                progress("kernels", 1, 1)
-            return match_and_assemble(
-                job, connection.client, seconds, progress, overwrite=overwrite, keep_tiles=keep_tiles
-            )
+            if not job.begin():
+                report = complete_before(job)
+            else:
+                with logged_stage(seconds, "kernels"):
+                    progress("kernels", 0, 1)
+                    compile_kernels(job.config, hands_states_on=job.hands_states_on)
+                    progress("kernels", 1, 1)
+                report = match_and_assemble(job, connection, seconds, progress)
+            end_tiles(job, keep_tiles=keep_tiles)
+            return report
 
 
-def complete_before(job: Job, *, keep_tiles: bool) -> dict[str, Any]:
-    """Return the report of a run that was already complete; remove tiles that a death left."""
+def complete_before(job: Job) -> dict[str, Any]:
+    """Return the report of a run that was already complete."""
     report = open_run(job.out).report
-    if home_of(job.out).exists():
-        end_tiles(job, keep_tiles=keep_tiles)
     _LOG.warning("the run in %s was already complete", job.out)
     return report
 
 
-def find_on(connection: Connection, seconds: dict[str, float], progress: Progress, left: Image, right: Image) -> Found:
-    """Find the search range of a pair on a cluster; see `search_range`. The time is added to ``seconds``."""
-    with logged_stage(seconds, "start.range"):
-        return search_range(connection.client(), left, right, progress)
-
-
-def match_and_assemble(
-    job: Job,
-    client: Callable[[], Workers],
-    seconds: dict[str, float],
-    progress: Progress,
-    *,
-    overwrite: bool,
-    keep_tiles: bool,
-) -> dict[str, Any]:
+def match_and_assemble(job: Job, workers: Workers, seconds: dict[str, float], progress: Progress) -> dict[str, Any]:
     """Match the tiles of a run that are not done, and write its files, see `assemble`; damaged tiles are made again."""
     for attempt in range(_TRIES + 1):
         try:
-            _match_tiles(job, client, seconds, progress)
-            return assemble(job, client, seconds, progress, overwrite=overwrite, keep_tiles=keep_tiles)
+            with logged_stage(seconds, "tiles"):
+                with logged_stage(seconds, "tiles.images"):
+                    measure_images(workers, job, progress)
+                for matched in match_jobs(workers, [job], progress) if job.waiting() else ():
+                    check_failures(job, matched.failures)
+                    add_seconds(seconds, matched.seconds)
+            return assemble(job, workers, seconds, progress)
         except DamagedTilesError as error:
             if attempt == _TRIES:
                 raise
@@ -127,34 +120,21 @@ def match_and_assemble(
     raise AssertionError  # not reached
 
 
-def _match_tiles(job: Job, client: Callable[[], Workers], seconds: dict[str, float], progress: Progress) -> None:
-    with logged_stage(seconds, "tiles"):
-        with logged_stage(seconds, "tiles.images"):
-            if not job.has_statistics():
-                measure_images(client(), job, progress)
-        if job.waiting():
-            for matched in match_jobs(client(), [job], progress):
-                check_failures(job, matched.failures)
-                add_seconds(seconds, matched.seconds)
-
-
-def measure_images(client: Workers, job: Job, progress: Progress) -> None:
+def measure_images(workers: Workers, job: Job, progress: Progress) -> None:
     """Measure mean and standard deviation of both images and keep them, if the cost needs them and they are missing."""
     if not job.has_statistics():
         images = job.left, job.right
-        job.write_statistics(PairStatistics(*(_measured(client, image, job, progress) for image in images)))
+        job.write_statistics(PairStatistics(*(_measured(workers, image, job, progress) for image in images)))
 
 
-def _measured(client: Workers, image: Image, job: Job, progress: Progress) -> ImageStatistics:
+def _measured(workers: Workers, image: Image, job: Job, progress: Progress) -> ImageStatistics:
     windows, retries = blocks(image.height, image.width), job.config.cluster.retries
-    found: dict[int, Moments] = {}
     tasks = (Task(i, measure_block, (image, block), retries) for i, block in enumerate(windows))
-    for outcome in client.outcomes(tasks):
-        if outcome is not None and outcome.error is not None:
-            raise RunError(f"{image.path} could not be measured: {reason(outcome.error)}") from outcome.error
-        if outcome is not None:
-            found[outcome.label] = outcome.result
-        progress("images", len(found), len(windows))
+
+    def failed(_: int, error: BaseException) -> NoReturn:
+        raise RunError(f"{image.path} could not be measured: {reason(error)}") from error
+
+    found = dict(results(workers, tasks, failed, lambda done: progress("images", done, len(windows))))
     return statistics_of(found[i] for i in range(len(windows)))
 
 
@@ -177,7 +157,7 @@ class Matched(NamedTuple):
     seconds: dict[str, float]
 
 
-def match_jobs(client: Workers, jobs: Sequence[Job], progress: Progress) -> Iterator[Matched]:
+def match_jobs(workers: Workers, jobs: Sequence[Job], progress: Progress) -> Iterator[Matched]:
     """Match the unfinished tiles of jobs, a bounded number at a time; yield each job after its last tile."""
     waiting = [job.waiting() for job in jobs]
     schedules = [_schedule(job, tiles) for job, tiles in zip(jobs, waiting, strict=True)]
@@ -186,7 +166,7 @@ def match_jobs(client: Workers, jobs: Sequence[Job], progress: Progress) -> Iter
     yield from (ended for ended, schedule in zip(matched, schedules, strict=True) if not schedule)
     done = total - sum(map(len, schedules))
     progress("tiles", done, total)
-    for outcome in client.outcomes(_tasks(jobs, schedules)):
+    for outcome in workers.outcomes(_tasks(jobs, schedules)):
         if outcome is None:
             progress("tiles", done, total)
             continue

@@ -72,7 +72,7 @@ def plan(
     region = checked_region(left, window)
     strip = min(BLOCK, region.height), region.width
     if memory is not None:
-        check_strips(*strip, config, memory)
+        check_strips(*strip, memory)
     check_tiles(config, region)
     grid = Grid(region, config.tiles.size)
     # Compiled once a machine: a part of the first plan, not of the run.
@@ -82,7 +82,7 @@ def plan(
     files = run_files(config.products.compression)
     together = workers if config.cluster.kind == "threads" else cores_of_process(config.cluster)
     waiting = readers(config.cluster) * waiting_bytes(config)
-    task = max(tile_bytes(config), strip_bytes(*strip, config.products.compression))
+    task = max(tile_bytes(config), strip_bytes(*strip))
     return Plan(
         search_range=(int(config.disparity.minimum), int(config.disparity.maximum)),
         tile_size=config.tiles.size,
@@ -116,24 +116,13 @@ def _work(grid: Grid, whole: Window, config: Config) -> int:
     """Return the pixels visited per SGM sweep, averaged over both: the patch without the rows after its core."""
     if config.tiles.overlap == "exact":
         return _path_pixels(grid.region, grid.region, whole, config)
-    overlap = config.tiles.margin
-    total = 0
-    for row, rows in _kinds(grid.rows, -(-overlap // grid.size)):
-        for column, columns in _kinds(grid.columns, -(-overlap // grid.size)):
-            core = grid.tile(row, column).core
-            patch = core.grown(overlap, overlap).clipped(grid.region)
-            total += rows * columns * (patch.width * (core.height + patch.height) // 2)
-    return total
 
+    def patch(core: Window) -> Window:
+        return core.grown(config.tiles.margin, config.tiles.margin).clipped(grid.region)
 
-def _kinds(count: int, reach: int) -> Iterator[tuple[int, int]]:
-    """Yield places along one axis of the grid and how many are alike: inner ones far from both ends are grouped."""
-    ends = reach + 1
-    if count <= 2 * ends:
-        yield from ((place, 1) for place in range(count))
-    else:
-        yield from ((place, 1) for place in (*range(ends), *range(count - ends, count)))
-        yield ends, count - 2 * ends
+    rows = [grid.tile(row, 0).core for row in range(grid.rows)]
+    columns = [grid.tile(0, column).core for column in range(grid.columns)]
+    return sum(core.height + patch(core).height for core in rows) * sum(patch(core).width for core in columns) // 2
 
 
 def _expected(left: Image, right: Image, config: Config, workers: int, grid: Grid) -> tuple[float, float]:

@@ -59,35 +59,18 @@ def _calibration(config: Config) -> dict[str, Any] | None:
     return {"name": calibration.name, "sha256": calibration.sha256, **levels.model_dump()}
 
 
-def _counts(config: Config, parts: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the counts of all pixels from the records of the parts."""
+def report_of(
+    job: Job, tables: Tables, scale: ConfidenceScale, parts: Iterable[Mapping[str, Any]], seconds: dict[str, float]
+) -> dict[str, Any]:
+    """Return the content of run.json."""
+    grid, config, statistics = job.store.grid, job.config, job.statistics()
     tally = Tally(config.disparity.count, config.disparity.minimum)
     for part in parts:
         tally.merge(part.get("counts", {}))
-    return tally.report()
-
-
-def _add_seconds(seconds: dict[str, float], tables: Tables) -> None:
-    """Add the seconds of all tiles by stage, and the total."""
-    for stage in ("read", "match", "write"):
-        seconds[f"tiles.{stage}"] = sum(record["seconds"][stage] for record in tables.records.values())
+    counts, quality = tally.report(), quality_of(job, tables.records)
+    of_tiles = [record["seconds"] for record in tables.records.values()]
+    seconds |= {f"tiles.{stage}": sum(each[stage] for each in of_tiles) for stage in ("read", "match", "write")}
     seconds["total"] = sum(value for stage, value in seconds.items() if "." not in stage)
-
-
-def report_of(
-    job: Job,
-    tables: Tables,
-    scale: ConfidenceScale,
-    parts: Iterable[Mapping[str, Any]],
-    seconds: dict[str, float],
-) -> dict[str, Any]:
-    """Return the content of run.json."""
-    grid = job.store.grid
-    config = job.config
-    _add_seconds(seconds, tables)
-    statistics = job.statistics()
-    counts = _counts(config, parts)
-    quality = quality_of(job, tables.records)
     return {
         "run": job.name,
         "finished": datetime.now(UTC).isoformat(timespec="microseconds"),  # distinguishes runs

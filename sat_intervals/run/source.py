@@ -6,7 +6,7 @@ import numpy as np
 
 from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.match.local_ranges import LocalRanges
-from sat_intervals.match.matching_cost import Area, MatchingCost, cost_areas, view_windows
+from sat_intervals.match.matching_cost import MatchingCost, cost_areas, view_windows
 from sat_intervals.match.mccnn import Network, network_of
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.patch import Frame, patch_areas
@@ -37,7 +37,8 @@ def read_source(job: Job, block: Tile, ranges: LocalRanges | None, seconds: dict
     """Read both images in the windows of a block's tiles."""
     job.check_version()  # before any work
     statistics, network = job.statistics(), network_of(job.config.cost, job.inputs)
-    windows = [view_windows(_areas(job, tile, ranges), job.config) for tile in job.store.grid.within(block.core)]
+    areas = (patch_areas(frame_of(job, tile), job.config, ranges) for tile in job.store.grid.within(block.core))
+    windows = [view_windows(of_tile, job.config) for of_tile in areas]
     left, right = map(hull, zip(*windows, strict=True))
     with timed(seconds, "read"):
         return Source(_views(job, block, (left, right)), statistics, network)
@@ -60,15 +61,11 @@ def _views(job: Job, block: Tile, windows: tuple[Window, Window]) -> Views:
     return views
 
 
-def _areas(job: Job, tile: Tile, ranges: LocalRanges | None) -> list[Area]:
-    return patch_areas(frame_of(job, tile), job.config, ranges)
-
-
 def costed(
     job: Job, tile: Tile, source: Source, ranges: LocalRanges | None, seconds: dict[str, float]
 ) -> tuple[Views, list[MatchingCost]]:
     """Crop both images to a tile, and compute the costs of its areas; precomputed ones are kept for other steps."""
-    areas, config, name = _areas(job, tile, ranges), job.config, tile.name
+    areas, config, name = patch_areas(frame_of(job, tile), job.config, ranges), job.config, tile.name
     of_pair = source.statistics, source.network
     left, right = zip(source.views, view_windows(areas, config), strict=True)
     views = left[0].cropped(left[1]), right[0].cropped(right[1])

@@ -24,7 +24,7 @@ def read_report(out: Path) -> dict[str, Any] | None:
     try:
         report = json.loads((out / RUN_REPORT).read_bytes())
         return report if report.keys() >= _SECTIONS else None
-    except (FileNotFoundError, NotADirectoryError, ValueError, AttributeError, RecursionError):
+    except (FileNotFoundError, NotADirectoryError, ValueError, AttributeError):
         return None
     except OSError as error:
         raise SatIntervalsError(

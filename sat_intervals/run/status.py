@@ -57,7 +57,7 @@ def read_report(out: Path) -> dict[str, dict[str, Any]] | None:
         if not states or not all(ended["state"] in _STATES for ended in states.values()):
             raise ValueError("it has other states")
         return states
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise SatIntervalsError(
             f"{out / REPORT} is not the report of a batch: move it away and rerun the batch"
         ) from error

@@ -1,7 +1,8 @@
 """Finish strips of a run on workers: final bands, compressed as parts of the files, and overviews, as a binary tree."""
 
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -16,7 +17,7 @@ from sat_intervals.match.statistics import Tally
 from sat_intervals.progress import Progress
 from sat_intervals.raster import BLOCK, RUN_FILES, codec_versions, compressed, factors, run_files
 from sat_intervals.run.job import Job
-from sat_intervals.run.workers import Task, Workers, check_not_full, computing, picklable_errors, reason
+from sat_intervals.run.workers import Task, Workers, check_not_full, computing, picklable_errors, reason, results
 from sat_intervals.store.arrays import DamagedFileError
 from sat_intervals.store.manifest import digest
 from sat_intervals.store.tiles import PARTS, DamagedTilesError
@@ -51,7 +52,7 @@ def part_name(key: PartKey) -> str:
 
 
 def finish_strips(
-    job: Job, client: Callable[[], Workers], scale: ConfidenceScale, progress: Progress
+    job: Job, workers: Workers, scale: ConfidenceScale, progress: Progress
 ) -> dict[PartKey, dict[str, Any]]:
     """Make the parts of a run that are missing, once its tiles are done; return ``meta`` of all parts."""
     counts, height = rows_of_levels(job.store.grid.region), job.store.grid.region.height
@@ -68,23 +69,25 @@ def finish_strips(
                 yield None
             else:
                 waiting.remove(key)
-                yield _task(job, key, counts, scale, of)
+                more = [_below(key, counts)] if key[0] else [scale]
+                function = reduce_rows if key[0] else finish_strip
+                yield Task(key, function, (job, of, key, *more), job.config.cluster.retries)
 
-    for outcome in client().outcomes(tasks()) if waiting else ():
-        if outcome is not None and outcome.error is not None:
-            _fail(job, outcome.label, outcome.error)
-        if outcome is not None and outcome.result is not None:
-            damaged.append(outcome.result)  # the other strips are finished before tiles are matched again
-        elif outcome is not None:
-            done.add(outcome.label)
+    def look(_: int) -> None:
         progress("bands", min(height, BLOCK * sum(level == 0 for level, _ in done)), height)
+
+    for key, damage in results(workers, tasks(), partial(_fail, job), look) if waiting else ():
+        if damage is None:
+            done.add(key)
+        else:
+            damaged.append(damage)  # the other strips are finished before tiles are matched again
     if damaged:
         raise DamagedTilesError(damaged[0])
-    found = {key: job.store.meta(PARTS, part_name(key), of) for key in keys}
-    if missing := [part_name(key) for key in keys if found[key] is None]:
+    found = {key: meta for key in keys if (meta := job.store.meta(PARTS, part_name(key), of)) is not None}
+    if missing := [part_name(key) for key in keys if key not in found]:
         raise damaged_parts(job, missing)
     progress("bands", height, height)
-    return {key: meta for key, meta in found.items() if meta is not None}
+    return found
 
 
 def damaged_parts(job: Job, names: Sequence[str]) -> DamagedTilesError:
@@ -100,19 +103,6 @@ def _below(key: PartKey, counts: Sequence[int]) -> list[PartKey]:
     """Return the one or two rows of the level below that a row of an overview is made of."""
     level, row = key
     return [(level - 1, below) for below in (2 * row, 2 * row + 1) if level and below < counts[level - 1]]
-
-
-def _task(job: Job, key: PartKey, counts: Sequence[int], scale: ConfidenceScale, of: str) -> Task:
-    retries = job.config.cluster.retries
-    if key[0]:
-        return Task(key, reduce_rows, (job, of, key, _below(key, counts)), retries)
-    return Task(key, finish_strip, (job, of, key, scale), retries)
-
-
-def _rows(job: Job, row: int, margin: int = 0) -> tuple[int, int]:
-    """Return the first row of a strip, and the one after its last, grown by a margin inside the region."""
-    height = job.store.grid.region.height
-    return max(0, row * BLOCK - margin), min(height, (row + 1) * BLOCK + margin)
 
 
 def _fail(job: Job, key: PartKey, error: BaseException) -> NoReturn:
@@ -131,15 +121,16 @@ def finish_strip(job: Job, of: str, key: PartKey, scale: ConfidenceScale) -> str
     # also while it reads and writes: more strips at once would need more memory than `check_tiles` allows for
     with picklable_errors(), computing(job.config.cluster):
         check_codecs(job, of)
-        (first, last), (top, bottom) = _rows(job, key[1]), _rows(job, key[1], halo(job.config))
-        shape, search = (last - first, job.store.grid.region.width), job.config.disparity
+        region, search, margin = job.store.grid.region, job.config.disparity, halo(job.config)
+        first, last = key[1] * BLOCK, min(region.height, (key[1] + 1) * BLOCK)
+        top, bottom = max(0, first - margin), min(region.height, last + margin)
+        shape = last - first, region.width
         intervals, validity = np.empty((4, *shape), np.float32), np.empty((1, *shape), np.uint16)
         tally, row = Tally(search.count, search.minimum), 0
         raw = job.store.strips(max(1, STRIP_PIXELS // shape[1]), search.count, top, bottom)
         try:
-            for final in postprocess_strip(
-                (RawRows(**piece) for piece in raw), first - top, shape[0], scale, job.config
-            ):
+            pieces = (RawRows(**piece) for piece in raw)
+            for final in postprocess_strip(pieces, first - top, shape[0], scale, job.config):
                 rows = slice(row, row := row + len(final.validity))
                 intervals[:, rows], validity[:, rows] = final[:4], final.validity
                 tally.add(final)

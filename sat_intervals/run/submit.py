@@ -1,23 +1,40 @@
-"""Submit tasks to a dask cluster, a bounded number at a time; dask repeats them and replaces lost workers."""
+"""Clusters of dask, and tasks on them, a bounded number at a time; dask repeats these and replaces lost workers.
+
+A cluster is processes of this machine, an existing scheduler, or jobs of a batch system.
+"""
 
 import asyncio
 import itertools
 import logging
+import signal
 import time
 import uuid
 from collections.abc import Iterator
 from concurrent.futures import CancelledError, Future
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
-from distributed import Client
+import dask
+from distributed import Client, LocalCluster
 from distributed import Future as DaskFuture
 from distributed.client import ClosedClientError
+from distributed.utils import silence_logging_cmgr
 
-from sat_intervals.errors import RunError
-from sat_intervals.run.batch_system import check_accepted, logs_of
-from sat_intervals.run.workers import CHECK_EVERY, Outcome, Task, in_flight
+from sat_intervals.config import Cluster
+from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.machine import usable_cores
+from sat_intervals.run.batch_system import batch_system
+from sat_intervals.run.workers import CHECK_EVERY, Outcome, Task, in_flight, readers, reason
 
+STARTING = 120.0  # seconds for local worker processes to start
+DASK = {
+    "distributed.scheduler.allowed-failures": 3,  # deaths of workers that a task survives
+    "distributed.scheduler.worker-ttl": "5 minutes",  # a stopped worker's tasks then go to others
+    # What dask watches of itself, for dashboards. By default it takes 2 % of a core in each process.
+    "distributed.admin.tick.interval": "1s",
+    "distributed.worker.profile.enabled": False,
+}
 WORKERS_GONE = 300.0  # seconds after the last worker left, at which a run ends
 _WARN_EVERY = 60.0  # seconds between warnings while there is no worker
 
@@ -59,8 +76,13 @@ class DaskWorkers:
 
     def _check_wait(self, now: float) -> None:
         """Raise if no worker will come; otherwise warn every minute. Nothing limits the wait for the first one."""
-        check_accepted(self._client.cluster)
-        where = logs_of(self._client.cluster)
+        system: Any = self._client.cluster
+        where = ""
+        if hasattr(system, "logged"):  # see `batch_system`
+            where = f": see the queue, and the logs of the jobs in {system.logged}"
+            if system.refusals and not system.submitted:
+                refusal = " ".join(system.refusals[0].split())
+                raise SatIntervalsError(f"the batch system refuses the job: {refusal}: check the section cluster")
         if self._seen is not None and now - self._seen > WORKERS_GONE:
             raise RunError(
                 f"the last worker ended and none has started for {WORKERS_GONE:.0f} s{where}; rerun the same command: "
@@ -99,3 +121,74 @@ def _scheduler_errors() -> Iterator[None]:
         yield
     except (OSError, ClosedClientError, CancelledError) as error:
         raise RunError("the dask scheduler is gone; rerun the same command: it resumes") from error
+
+
+# ---- Clusters ----------------------------------------------------------------------------------------------
+@contextmanager
+def connected(settings: Cluster, out: Path) -> Iterator[Client]:
+    """Connect a client to the cluster of the settings; close it, and what it started, at the end."""
+    with dask.config.set(DASK), _client(settings, out) as client:
+        _LOG.info("connected to %s", client)
+        if settings.kind == "processes":
+            client.register_worker_callbacks(_ignore_interrupts)
+        if settings.kind != "address" and logging.getLogger("sat_intervals").isEnabledFor(logging.DEBUG):
+            client.register_worker_callbacks(_log_all)
+            for name in ("sat_intervals", "distributed"):
+                client.forward_logging(name)
+        yield client
+    _LOG.info("disconnected")
+
+
+def _ignore_interrupts() -> None:
+    """Leave Ctrl-C, which a terminal sends to all processes, to the main one: it closes the others."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _log_all() -> None:
+    """Log everything on a worker, for ``--debug``."""
+    logging.getLogger("sat_intervals").setLevel(logging.DEBUG)
+
+
+@contextmanager
+def _client(settings: Cluster, out: Path) -> Iterator[Client]:
+    if settings.kind == "address":
+        with silence_logging_cmgr(logging.CRITICAL), _client_of(str(settings.address)) as client:
+            yield client
+    elif settings.kind == "processes":
+        workers = settings.workers or usable_cores()
+        with _local(workers, 1 + readers(settings)) as cluster, Client(cluster) as client:
+            cluster.adapt(minimum=workers, maximum=workers)  # replaces those that are killed as they start
+            yield client
+    else:
+        with batch_system(settings, out / "logs") as cluster, Client(cluster) as client:
+            # Adapting, unlike scaling, resubmits jobs that end before the run, even between equal bounds.
+            cluster.adapt(minimum_jobs=settings.jobs, maximum_jobs=settings.maximum_jobs or settings.jobs)
+            yield client
+
+
+def _client_of(address: str) -> Client:
+    try:
+        return Client(address)
+    except (OSError, ValueError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise SatIntervalsError(f"no dask scheduler answers at {address}: {why}") from error
+
+
+def _local(workers: int, threads: int) -> LocalCluster:
+    try:
+        return LocalCluster(
+            n_workers=workers,
+            threads_per_worker=threads,
+            dashboard_address="127.0.0.1:0",
+            worker_dashboard_address="127.0.0.1:0",
+            silence_logs=logging.CRITICAL,
+            death_timeout=STARTING,
+        )
+    except Exception as error:  # any error at the start, such as a full /dev/shm
+        cause: BaseException = error
+        while earlier := cause.__cause__ or cause.__context__:
+            cause = earlier
+        raise RunError(
+            f"the {workers} worker processes did not start ({reason(cause)}): give "
+            "fewer --workers, more room in /dev/shm or another DASK_TEMPORARY_DIRECTORY, or use --cluster threads"
+        ) from error

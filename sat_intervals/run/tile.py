@@ -51,7 +51,21 @@ def measure_block(image: Image, block: Window) -> Moments:
 def match_block(job: Job, block: Tile) -> None:
     """Match the tiles of a block and write their intermediate products; runs on a worker."""
     with _logged_failure(job, block.name), picklable_errors():
-        _match_block(job, block)
+        read: dict[str, float] = {}
+        tiles, ranges = job.store.grid.within(block.core), job.ranges()
+        source = read_source(job, block, ranges, read)
+        handed: list[Handed] = []
+        if job.hands_states_on:
+            with timed(read, "read"):
+                handed = [
+                    _handed(job, block, wavefront, inside=len(tiles) > 1 and wavefront != LAST)
+                    for wavefront in range(len(WAVEFRONTS))
+                ]
+            tiles = in_order(LAST, tiles)  # whose states come with the matched tiles
+        for tile in tiles:
+            _match_tile(job, tile, source, handed, ranges, {"read": read["read"] / len(tiles)})
+        if job.hands_states_on:
+            _write_states(job, block, LAST, handed[LAST])
 
 
 def trace_block(job: Job, block: Tile, wavefront: int) -> dict[str, float]:
@@ -67,25 +81,6 @@ def _logged_failure(job: Job, step: str) -> Iterator[None]:
     except Exception:
         _LOG.info("tile %s failed; it is tried again at most %d times", step, job.config.cluster.retries, exc_info=True)
         raise
-
-
-def _match_block(job: Job, block: Tile) -> None:
-    read: dict[str, float] = {}
-    tiles, ranges = job.store.grid.within(block.core), job.ranges()
-    source = read_source(job, block, ranges, read)
-    handed: list[Handed] = []
-    if job.hands_states_on:
-        with timed(read, "read"):
-            handed = [
-                _handed(job, block, wavefront, inside=len(tiles) > 1 and wavefront != LAST)
-                for wavefront in range(len(WAVEFRONTS))
-            ]
-        tiles = in_order(LAST, tiles)  # whose states come with the matched tiles
-    for tile in tiles:
-        seconds = {"read": read["read"] / len(tiles)}
-        _match_tile(job, tile, source, handed, ranges, seconds)
-    if job.hands_states_on:
-        _write_states(job, block, LAST, handed[LAST])
 
 
 def _match_tile(

@@ -12,12 +12,12 @@ import numpy as np
 from sat_intervals.config import Calibration, Interval
 from sat_intervals.config.candidates import changed
 from sat_intervals.config.weights import weights_file
-from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.errors import InputError, RunError, SatIntervalsError
 from sat_intervals.match.calibration import left_out, means
 from sat_intervals.match.mccnn import load_network
 from sat_intervals.match.measurement import ladder
 from sat_intervals.progress import Progress
-from sat_intervals.raster import InputError, OutputError
+from sat_intervals.raster import OutputError
 from sat_intervals.run.calibrate import calibration_from
 from sat_intervals.run.measure import Subject, measure_subjects
 from sat_intervals.store.manifest import StoreError

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cache
 from queue import Empty, SimpleQueue
 from threading import BoundedSemaphore
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, NoReturn, Protocol
 
 from sat_intervals.config import Cluster, ConfigError
 from sat_intervals.errors import RunError, SatIntervalsError
@@ -19,6 +19,7 @@ CHECK_EVERY = 2.0  # seconds after which the caller is asked for more tasks, if 
 _FULL_DISK = errno.ENOSPC, errno.EDQUOT
 
 _LOG = logging.getLogger(__name__)
+_turns = cache(BoundedSemaphore)  # one for each number
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,23 @@ class Workers(Protocol):
         """Run tasks, a bounded number at once; yield outcomes, and None regularly. A task None waits for others."""
 
 
+def results(
+    workers: Workers,
+    tasks: Iterator[Task | None],
+    failed: Callable[[Any, BaseException], NoReturn],
+    look: Callable[[int], None],
+) -> Iterator[tuple[Any, Any]]:
+    """Yield label and result of each task; ``failed`` raises for an error, ``look`` is given the number done."""
+    done = 0
+    for outcome in workers.outcomes(tasks):
+        if outcome is not None:
+            if outcome.error is not None:
+                failed(outcome.label, outcome.error)
+            done += 1
+            yield outcome.label, outcome.result
+        look(done)
+
+
 def readers(settings: Cluster) -> int:
     """Return how many threads of a process read and write while others compute: one if tiles are in a bucket."""
     return int(settings.kind != "address" and is_remote(settings))
@@ -59,11 +77,6 @@ def is_remote(settings: Cluster) -> bool:
 def computing(settings: Cluster) -> AbstractContextManager[Any]:
     """Return a context for the kernels of a tile or strip: no more threads are in it at once than without `readers`."""
     return _turns(cores_of_process(settings)) if readers(settings) else nullcontext()
-
-
-@cache
-def _turns(count: int) -> BoundedSemaphore:
-    return BoundedSemaphore(count)
 
 
 def cores_of_process(settings: Cluster) -> int:

@@ -95,13 +95,7 @@ def numbered(arrays: Iterable[np.ndarray]) -> Iterator[tuple[str, np.ndarray]]:
 
 @contextmanager
 def unpacked(folder: Folder, name: str, of: str) -> Iterator[Archive]:
-    """Open a file of a folder for reading some of its arrays.
-
-    Raises
-    ------
-    DamagedFileError
-        It is missing, damaged, or was written for something else than ``of``.
-    """
+    """Open a file of a folder for reading some of its arrays; DamagedFileError if it is not there for ``of``."""
     with ExitStack() as stack:
         with _damage_noticed():
             stream = stack.enter_context(folder.opened(name))

@@ -61,11 +61,6 @@ class Folder:
         with stream:
             yield stream
 
-    def read(self, name: str) -> bytes:
-        """Read a file."""
-        with self._reached() as system:
-            return bytes(system.cat_file(self._path(name)))
-
     def write(self, name: str, content: bytes | memoryview, *, is_flushed: bool = False) -> None:
         """Write a file that exists only when it is complete; ``is_flushed``: also after a power loss."""
         if not self.is_local:

@@ -13,13 +13,7 @@ _LOCK = ".sat-intervals.lock"
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Create and lock a folder for the block; the lock ends with its process, its file stays.
-
-    Raises
-    ------
-    SatIntervalsError
-        Another run is active there, or the folder cannot be locked.
-    """
+    """Create and lock a folder for the block; the lock ends with its process, its file stays."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         stream = open(folder / _LOCK, "ab")  # noqa: SIM115

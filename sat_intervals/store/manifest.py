@@ -24,20 +24,14 @@ class StoreError(SatIntervalsError):
 
 
 def read_manifest(home: Path) -> dict[str, Any] | None:
-    """Read the manifest in the folder of a run's tiles, None without one.
-
-    Raises
-    ------
-    StoreError
-        It is damaged.
-    """
+    """Read the manifest in the folder of a run's tiles, None without one; raise StoreError if it is damaged."""
     try:
         manifest = json.loads((home / MANIFEST).read_bytes())
         grid_of(manifest)
         manifest[PLACE]
     except (FileNotFoundError, NotADirectoryError):
         return None
-    except (LookupError, TypeError, ValueError, RecursionError) as error:
+    except (LookupError, TypeError, ValueError) as error:
         raise StoreError(
             f"{home / MANIFEST} is damaged: start again with --overwrite, or restore it to resume"
         ) from error

@@ -34,40 +34,20 @@ class DamagedTilesError(RunError):
 
 
 class Tables(NamedTuple):
-    """What is summed over all tiles.
+    """What is summed over all tiles, or kept of each."""
 
-    Attributes
-    ----------
-    histogram
-        int64 ``(ambiguities + 1,)``: pixels by ambiguity.
-    seams
-        int16 ``(grid rows, grid columns, side, own or ring, products, size)``; None with exact seams.
-    records
-        ``meta`` of the tiles, by name.
-    """
-
-    histogram: np.ndarray
-    seams: np.ndarray | None
-    records: dict[str, dict[str, Any]]
+    histogram: np.ndarray  # int64 (ambiguities + 1,): pixels by ambiguity
+    seams: np.ndarray | None  # int16 (grid rows, grid columns, side, own or ring, products, size); None if exact
+    records: dict[str, dict[str, Any]]  # ``meta`` of the tiles, by name
 
 
 @dataclass(frozen=True)
 class Store:
-    """The intermediate files of one run; picklable, so that workers write their own.
-
-    Attributes
-    ----------
-    folder
-        Where they are.
-    grid
-        The tiles.
-    run
-        Digest of the manifest: a file of another run counts as missing.
-    """
+    """The intermediate files of one run; picklable, so that workers write their own."""
 
     folder: Folder
     grid: Grid
-    run: str
+    run: str  # digest of the manifest: a file of another run counts as missing
 
     def write(
         self, kind: str, name: str, arrays: Iterable[tuple[str, np.ndarray]] = (), *, of: str = "", **meta: Any
@@ -154,23 +134,10 @@ class Store:
         return Tables(histogram, np.reshape(seams, (*shape, *seams[0].shape)) if seams else None, records)
 
     def strips(self, rows: int, count: int, first: int = 0, last: int | None = None) -> Iterator[dict[str, np.ndarray]]:
-        """Yield products of full-width strips, as fields of `RawRows`.
+        """Yield products of full-width strips of about ``rows`` rows, as fields of `RawRows`, of ``count`` disparities.
 
-        The right views of the tiles are merged: smallest cost, largest disparity at ties.
-
-        Parameters
-        ----------
-        rows
-            Wanted height of a strip.
-        count
-            Number of disparities.
-        first, last
-            The rows ``[first, last)`` of the region, by default all.
-
-        Raises
-        ------
-        DamagedTilesError
-            Names the tiles that were damaged.
+        They have the rows ``[first, last)`` of the region, by default all. The right views of the tiles are merged:
+        smallest cost, largest disparity at ties. DamagedTilesError names damaged tiles.
         """
         step, last = max(_ROWS, rows // _ROWS * _ROWS), self.grid.region.height if last is None else last
         for start in range(first // step * step, last, step):

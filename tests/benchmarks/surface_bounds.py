@@ -2,9 +2,9 @@
 
 Towns, slopes and rough ground, at three base-to-height ratios, are matched with a coverage of .90, as four pairs each,
 which see the ground from other sides. Points come from the analytic cameras of the scenes. The envelope keeps open
-intervals, as without a coverage; the others leave them out. The truth of a cell is the height of the surface, seen from
-above, at its centre. Cells near a wall are apart: heights within one cell of the centre differ by more than 2.2 px of
-disparity, and more than the side of the cell. Matched pairs are kept in `build/surfaces`.
+intervals, as without a coverage; the median leaves them out. The truth of a cell is the height of the surface, seen
+from above, at its centre. Cells near a wall are apart: heights within one cell of the centre differ by more than 2.2 px
+of disparity, and more than the side of the cell. Matched pairs are kept in `build/surfaces`.
 """
 
 import sys
@@ -18,7 +18,8 @@ from pyproj import Transformer
 
 from sat_intervals import demo, match_pair
 from sat_intervals.demo import DATUM, PIXEL
-from sat_intervals.evaluate.calibration import Sample, fitted, held_out
+from sat_intervals.evaluate.accuracy import Heights
+from sat_intervals.evaluate.calibration import fitted, held_out
 from sat_intervals.heights.choices import BOUNDS, SurfaceChoices
 from sat_intervals.heights.dsm import make_surface
 from sat_intervals.kernels.conformal import widened
@@ -111,7 +112,7 @@ def truth_of(place, shape, kind):
 
 
 def surface_of(outs, path, cell, bounds, kind, pixel, like=None):
-    """Cells of a surface with interval and truth, as a sample of a calibration, and which of them are near walls.
+    """Cells of a surface with interval and truth, which of them are near walls, and the block of ground of each.
 
     With ``like``, another surface, on its grid: cells with an interval there.
     """
@@ -122,23 +123,22 @@ def surface_of(outs, path, cell, bounds, kind, pixel, like=None):
         truth, range_ = truth_of(dataset.transform, dataset.shape, kind)
         known = np.isfinite(truth) & np.isfinite(first.read(2))
     row, column = (4 * places // size for places, size in zip(np.nonzero(known), known.shape, strict=True))
-    sample = Sample(*(values[known] for values in (height, lower, upper, truth)), 4 * row + column)
-    return sample, range_[known] > max(2.2 * pixel, cell * PIXEL)
+    walls = range_[known] > max(2.2 * pixel, cell * PIXEL)
+    return Heights(height, lower, upper, truth).of(known), walls, 4 * row + column
 
 
-def figures(sample, walls, pixel, bounds=None):
+def figures(sample, walls, pixel):
     """Coverage of all cells, outside walls and near them; median and mean width in pixels."""
-    lower, upper = (sample.lower, sample.upper) if bounds is None else bounds
-    inside, width = (lower <= sample.reference) & (sample.reference <= upper), (upper - lower) / pixel
+    inside, width = sample.outside <= 0, sample.width / pixel
     near = inside[walls].mean() if walls.any() else np.nan
     return inside.mean(), inside[~walls].mean(), near, np.median(width), width.mean()
 
 
 def calibrated(sample, others):
-    """Bounds with the margins of other samples together."""
-    together = Sample(*(np.concatenate(values) for values in zip(*others, strict=True)))
-    fit = fitted(together, 1.0, 0.9)
-    return widened(sample.height, sample.lower, sample.upper, fit.limits, fit.margins)
+    """A sample with the margins of other samples together."""
+    fit = fitted(Heights(*(np.concatenate(values) for values in zip(*others, strict=True))), 1.0, 0.9)
+    lower, upper = widened(*sample[:3], fit.limits, fit.margins)
+    return sample._replace(lower=lower, upper=upper)
 
 
 class Table:
@@ -177,18 +177,19 @@ def compare_bounds(scenes):
     table = Table("bounds")
     for kind, ratio, cell in scenes:
         for bounds in BOUNDS:
-            table.add(kind, ratio, cell, bounds, figures(*cells_of(kind, ratio, cell, 1, bounds), 0.5 / ratio))
+            sample, walls, _ = cells_of(kind, ratio, cell, 1, bounds)
+            table.add(kind, ratio, cell, bounds, figures(sample, walls, 0.5 / ratio))
     table.end()
 
 
 def compare_calibrations(scenes):
     table = Table("calibrated on")
     samples = {scene: cells_of(*scene, 1, "median") for scene in scenes}
-    for (kind, ratio, cell), (sample, walls) in samples.items():
+    for (kind, ratio, cell), (sample, walls, block) in samples.items():
         others = [samples[other, ratio, cell][0] for other in KINDS if other != kind]
-        ways = {"nothing": None, "other blocks": held_out(sample, 1.0, 0.9), "other scenes": calibrated(sample, others)}
-        for label, bounds in ways.items():
-            table.add(kind, ratio, cell, label, figures(sample, walls, 0.5 / ratio, bounds))
+        by_blocks, by_scenes = held_out(sample, block, 1.0, 0.9), calibrated(sample, others)
+        for label, one in {"nothing": sample, "other blocks": by_blocks, "other scenes": by_scenes}.items():
+            table.add(kind, ratio, cell, label, figures(one, walls, 0.5 / ratio))
     table.end()
 
 
@@ -196,9 +197,9 @@ def compare_pairs(scenes):
     table = Table("pairs")
     for kind, ratio, cell in scenes:
         for pairs in (1, 2, 4):
-            sample, walls = cells_of(kind, ratio, cell, pairs, "median")
-            for label, bounds in ((f"{pairs}", None), (f"{pairs}, calibrated", held_out(sample, 1.0, 0.9))):
-                table.add(kind, ratio, cell, label, figures(sample, walls, 0.5 / ratio, bounds))
+            sample, walls, block = cells_of(kind, ratio, cell, pairs, "median")
+            for label, one in ((f"{pairs}", sample), (f"{pairs}, calibrated", held_out(sample, block, 1.0, 0.9))):
+                table.add(kind, ratio, cell, label, figures(one, walls, 0.5 / ratio))
     table.end()
 
 

@@ -179,9 +179,6 @@ def file_to_file(folder):
         f"files {stages['files']:.1f} s, starting {starting:.1f} s",
     )
     row("what all but the kernels adds to them", f"{100 * (one[0] / kernels - 1):.0f} %")
-    (folder / "none.yaml").write_text("products: {compression: none}\n")
-    plain = median_run(pairs[4000], folder / "out", 1, 3, ["--config", folder / "none.yaml"])
-    row("the same without compression", f"{100 * (plain[0] / plain[3]['seconds']['tiles.match'] - 1):.0f} %")
     row("strips, with reading, compressing and writing", f"{16 / stages['bands']:.0f} Mpx/s")
     if len(CORES) > 1:
         two = median_run(pairs[4000], folder / "out", 2, 3)

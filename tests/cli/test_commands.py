@@ -539,7 +539,7 @@ def test_match__interrupted_at_a_terminal_hears_nothing_of_its_workers(folder, t
 
 def test_match__on_a_disk_without_room_for_the_files_is_refused_and_goes_on_once_there_is_room(folder, tmp_path, disk):
     out, settings = disk(20 << 20) / "out", tmp_path / "settings.yaml"
-    settings.write_text("products: {compression: none}\n")
+    settings.write_text("products: {compression: zstd}\n")
     size = ("--tile-size", 64, "--set", "tiles.overlap=20")
     arguments = matching(folder, out, *size, "--quiet", "--keep-tiles", "--config", settings)
     command(*arguments)

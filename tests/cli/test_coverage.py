@@ -43,7 +43,7 @@ def test_evaluate_report_plot__show_the_coverage_asked_for(run, pair, tmp_path):
     report = json.loads(invoke("evaluate", run, "--json").output)
     assert report["nominal"] == 0.9
     assert report["all"]["interval_score"] >= report["all"]["mean_width"]
-    assert "nominal coverage, or alpha: 0.9" in invoke("evaluate", run).output
+    assert "coverage asked for: 0.9" in invoke("evaluate", run).output
     assert invoke("report", run).exit_code == 0
     assert "nominalSentence" in (run / "report.html").read_text()
     at_80 = tmp_path / "at_80"

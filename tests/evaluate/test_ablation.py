@@ -136,15 +136,6 @@ def test_ablate_pair__equals_runs_with_those_settings(scene, folder, method, mon
     assert report["baseline"]["accuracy"] < report["0.98"]["accuracy"]
 
 
-def test_ablate_pair__matches_once(folder, monkeypatch):
-    calls = []
-    matched = ablation.cost_volume
-    monkeypatch.setattr(ablation, "cost_volume", lambda *arguments: calls.append(1) or matched(*arguments))
-    monkeypatch.setattr(ablation, "match_right", None)
-    ablate_pair(*find_pairs([folder]))
-    assert len(calls) == 1
-
-
 def test_ablate_pair__says_what_it_cannot_use(folder, monkeypatch):
     (pair,) = find_pairs([folder])
     search = {"minimum": pair.minimum, "maximum": pair.maximum}

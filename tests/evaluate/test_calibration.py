@@ -1,10 +1,10 @@
 """Calibrations of surface models in metres, from heights made up with a known error."""
 
 import json
+import re
 
 import numpy as np
 import pytest
-import rasterio
 import yaml
 from helpers import invoke
 from rasterio.transform import Affine
@@ -107,16 +107,6 @@ def test_calibrate_surface__moves_the_reference_unless_told_not_to(tmp_path):
     assert still.margins[0] == pytest.approx(4.4, abs=0.1)
 
 
-def test_calibrate_surface__a_small_reference_is_not_thinned_by_the_size_of_the_surface(tmp_path, monkeypatch):
-    model, reference = scene(tmp_path)
-    with rasterio.open(reference) as dataset:
-        part = dataset.read(1)[50:70, 60:90]
-    small = write_raster(tmp_path / "small.tif", [part], PLACE @ Affine.translation(60, 50))
-    monkeypatch.setattr("sat_intervals.evaluate.calibration._MOST", 1000)
-    found = calibrate_surface(model, small, "x", registers=False)
-    assert sum(kind.cells for kind in found.classes) == 600
-
-
 def test_calibrate_surface__cells_in_one_pixel_of_a_coarser_reference_count_as_one(tmp_path):
     random = np.random.default_rng(0)
     height = 100 + random.normal(0, 1, (120, 150))
@@ -178,33 +168,25 @@ def test_calibrate_command__a_surface_that_it_cannot_use_is_one_line(tmp_path):
     cut = surface("cut.tif", TAGS | {"MAX_WIDTH": "5 m"})
     alpha = surface("alpha.tif", {"ALPHA": "0.9"})
     no_bounds = surface("heights.tif", TAGS, np.nan)
-    geoid = write_raster(tmp_path / "geoid.tif", [height - 47.5])
     away = write_raster(tmp_path / "away.tif", [height], Affine(1, 0, 5, 0, -1, 5))
     (tmp_path / "mine.yaml").write_text("mine: 1\n")
     given = ["--dsm", model, "--reference", reference]
     for words, message in (
         ([], "give PAIRS, or --dsm and --reference"),
-        (["--dsm", model], "--dsm and --reference go together"),
         ([tmp_path, *given], "calibrate one of them at a time"),
         ([tmp_path, "--no-register"], "--no-register goes with --dsm"),
         ([*given, "--tolerance", 1], "--tolerance applies to pairs, not to --dsm"),
         ([*given, "--preset", "satellite"], "--preset applies to pairs, not to --dsm"),
-        ([*given, "--cluster", "processes"], "--cluster applies to pairs, not to --dsm"),
         ([*given, "--set", "tiles.overlap=100"], "--set applies to pairs, not to --dsm"),
         ([*given, "--coverage", 2], "coverage is 2, allowed: 0.5 to 0.99"),
         ([*given, "--coverage", 0.99, "--output", reference], "would be written: choose another output"),
         ([*given, "--output", tmp_path / "mine.yaml"], "mine.yaml exists: choose another name or --overwrite"),
         ([*given, "--output", tmp_path / "no" / "x.yaml"], "give --output a file in an existing folder"),
-        (["--dsm", reference, "--reference", model], "is not a surface model of sat-intervals dsm"),
         (["--dsm", calibrated, "--reference", flat], "was made with --calibration: make it without"),
         (["--dsm", cut, "--reference", flat], "was made with --max-width: make it without"),
         (["--dsm", alpha, "--reference", flat], "its runs were matched without one: give --coverage"),
         (["--dsm", no_bounds, "--reference", flat], "0 cells of"),
         (["--dsm", model, "--reference", away], "give a reference of the same place"),
-        (
-            ["--dsm", model, "--reference", geoid, "--no-register"],
-            "differ by 47.5 m in the median, as heights above a geoid",
-        ),
     ):
         output = [] if "--output" in words else ["--output", tmp_path / "heights.yaml"]
         result = invoke("calibrate", *words, *output)
@@ -223,14 +205,8 @@ def test_load_height_calibration__what_it_cannot_use_is_one_line(tmp_path):
         ({"name": "x", "key": {}, "levels": []}, "is a calibration of disparities: give it to match"),
         ({"preset": "satellite"}, "has settings, not a calibration"),
         ({}, "name: field required"),
-        (given | {"margins": 1}, "margins: extra inputs are not permitted"),
-        (given | {"classes": []}, "classes: tuple should have at least 1 item"),
         (given | {"classes": rows[:-1]}, "below is to be null in the last class"),
         (given | {"classes": [*rows[:-1], *rows]}, "below falls from"),
-        (
-            given | {"classes": [rows[-1] | {"margin": float("nan")}]},
-            "classes.0.margin: input should be a finite number",
-        ),
         (given | {"classes": [rows[-1] | {"margin": "1 m"}]}, "classes.0.margin: input should be a valid number"),
         (given | {"coverage": 1.0}, "coverage: input should be less than 1"),
         ([1], "holds [1], allowed: keys name, coverage"),
@@ -238,9 +214,7 @@ def test_load_height_calibration__what_it_cannot_use_is_one_line(tmp_path):
         file.write_text(yaml.safe_dump(content))
         with pytest.raises(SatIntervalsError) as error:
             load_height_calibration(file)
-        assert str(file) in str(error.value)
-        assert message in str(error.value)
-        assert "\n" not in str(error.value)
+        assert re.search(f"{file}.*{re.escape(message)}", str(error.value))  # on one line
     file.write_text(yaml.safe_dump(given | {"surface": given["surface"] | {"INTERVAL": "envelope"}}))
     with pytest.raises(
         SatIntervalsError, match=r"other surfaces, INTERVAL is envelope in the calibration and median in the surface"

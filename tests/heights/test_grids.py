@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import rasterio
-from cameras import cameras, grid
+from cameras import cameras, grid, sensor_words
 from finished import write_run
 from helpers import invoke
 from rasterio.transform import Affine
@@ -41,9 +41,7 @@ def run(tmp_path):
 
 
 def triangulated(out, files):
-    names = ("--left-model", "--right-model", "--left-grid", "--right-grid")
-    words = [word for pair in zip(names, files, strict=True) for word in pair]
-    return invoke("triangulate", out, *words, "--quiet")
+    return invoke("triangulate", out, *sensor_words(files), "--quiet")
 
 
 def test_read_grid__displacements_give_the_points_of_positions(run, tmp_path):

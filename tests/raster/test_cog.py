@@ -88,16 +88,14 @@ def test_assemble__is_a_valid_file_with_every_level(tmp_path, monkeypatch, file,
         assert Georeferencing.of(dataset) == PLACE
 
 
-@pytest.mark.parametrize("compression", ["zstd", "lerc", "none"])
-def test_assemble__with_other_compressions(tmp_path, compression):
-    for file, shape in zip(run_files(compression), [(513, 40), (40, 30)], strict=True):
+def test_assemble__with_zstd(tmp_path):
+    for file, shape in zip(run_files("zstd"), [(513, 40), (40, 30)], strict=True):
         bands, path = noise(file, *shape), tmp_path / file.name
         write(path, bands, file)
         assert_valid(path)
         with rasterio.open(path) as dataset:
-            assert dataset.profile.get("compress", "none") == file.compression
-            error = 0.01001 if file.compression == "lerc" else 0
-            np.testing.assert_allclose(dataset.read(), bands, rtol=0, atol=error)
+            assert dataset.profile["compress"] == "zstd"
+            np.testing.assert_array_equal(dataset.read(), bands)
 
 
 def test_assemble__gives_the_same_bytes_whatever_the_order(tmp_path):
@@ -147,5 +145,5 @@ def test_codec_versions__follow_the_bytes_of_blocks(monkeypatch):
     monkeypatch.setitem(blocks._LEVELS, "deflate", {"zlevel": 9})
     assert codec_versions("deflate") == before  # once a process
     codec_versions.cache_clear()
-    assert codec_versions("deflate")["codecs"] != before["codecs"]
+    assert codec_versions("deflate")["codec"] != before["codec"]
     codec_versions.cache_clear()

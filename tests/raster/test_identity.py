@@ -224,23 +224,13 @@ def test_open_image__counts_each_file_on_a_server_once(web_server, images):
     put({**images, "left.tif.msk": mask_of(SIDE), "left.tif.ovr": images["right.tif"]}, web_server.folder)
     name = f"http://127.0.0.1:{web_server.server_address[1]}/left.tif"
     has_mask, *files = opened(name)
-    assert (has_mask, [file["path"] for file in files]) == (
-        True,
-        [name, f"/vsicurl/{name}.msk"],
-    )  # overviews are no input
+    assert has_mask
+    assert [file["path"] for file in files] == [name, f"/vsicurl/{name}.msk"]  # overviews are no input
     assert [file["bytes"] for file in files] == [len(images["left.tif"]), len(mask_of(SIDE))]
     assert all(file["etag"] for file in files)
 
 
-@pytest.mark.parametrize(
-    "way",
-    [
-        "/vsizip//vsicurl/{}/left.tif",
-        "/vsizip/{{/vsicurl/{}}}/left.tif",
-        "zip+{}!left.tif",
-        "vrt:///vsizip//vsicurl/{}/left.tif",
-    ],
-)
+@pytest.mark.parametrize("way", ["/vsizip//vsicurl/{}/left.tif", "zip+{}!left.tif"])
 def test_open_image__refuses_archives_on_servers(web_server, images, way):
     """Nobody would notice a change: GDAL does not say whether one has changed."""
     memory = io.BytesIO()
@@ -253,13 +243,6 @@ def test_open_image__refuses_archives_on_servers(web_server, images, way):
     assert "is read from files whose changes would not be noticed: download or extract it" in failure.value.stderr
 
 
-def test_open_image__refuses_a_stream(web_server, images):
-    put(images, web_server.folder)
-    with pytest.raises(subprocess.CalledProcessError) as failure:
-        opened(f"/vsicurl_streaming/http://127.0.0.1:{web_server.server_address[1]}/left.tif")
-    assert "is read from files whose changes would not be noticed" in failure.value.stderr
-
-
 def test_open_image__finds_a_mask_among_many_files_of_a_bucket(bucket, images, monkeypatch):
     """A listing has 1000 names; GDAL must not take its first page for all."""
     monkeypatch.setenv("AWS_S3_ENDPOINT", os.environ["AWS_ENDPOINT_URL"].removeprefix("http://"))
@@ -269,9 +252,8 @@ def test_open_image__finds_a_mask_among_many_files_of_a_bucket(bucket, images, m
     for key, content in (objects | {"many/left.tif": images["left.tif"], "many/left.tif.msk": mask_of(SIDE)}).items():
         boto3.client("s3").put_object(Bucket="bucket", Key=key, Body=content)
     has_mask, *files = opened(f"{bucket}/many/left.tif")
-    assert (has_mask, [file["path"] for file in files]) == (
-        True, [f"{bucket}/many/left.tif", "/vsis3/bucket/many/left.tif.msk"]
-    )  # fmt: skip
+    assert has_mask
+    assert [file["path"] for file in files] == [f"{bucket}/many/left.tif", "/vsis3/bucket/many/left.tif.msk"]
     assert all(file["etag"] for file in files)
 
 
@@ -280,9 +262,7 @@ def test_identity__of_a_server_that_does_not_say_which_file_it_sends(web_server,
     name = f"http://127.0.0.1:{web_server.server_address[1]}/left.tif"
     assert identity(name)["etag"]
     web_server.has_tags = False
-    with pytest.raises(
-        SatIntervalsError, match=r"left.tif: its server sends neither ETag nor Last-Modified, .*: downl"
-    ):
+    with pytest.raises(SatIntervalsError, match=r"left.tif: its server sends neither ETag nor Last-Modified"):
         identity(name)
 
 

@@ -8,7 +8,7 @@ import pytest
 from helpers import contents
 
 from sat_intervals.raster import OutputError, check_free, check_space, new_file, write_file
-from sat_intervals.raster.publishing import unfinished, way_out
+from sat_intervals.raster.publishing import unfinished
 
 
 def test_new_file__is_not_there_before_it_is_whole(tmp_path):
@@ -41,13 +41,6 @@ def test_new_file__keeps_what_was_there_if_the_block_fails(tmp_path, error):
     with pytest.raises(error):
         fail()
     assert contents(tmp_path) == {str(path): b"before"}
-
-
-def test_new_file__replaces_a_link_and_not_its_target(tmp_path):
-    (tmp_path / "mine").write_text("mine")
-    (tmp_path / "a.txt").symlink_to("mine")
-    write_file(tmp_path / "a.txt", b"new")
-    assert contents(tmp_path) == {str(tmp_path / "a.txt"): b"new", str(tmp_path / "mine"): b"mine"}
 
 
 def test_new_file__of_a_second_writer_is_refused(tmp_path):
@@ -121,8 +114,3 @@ def test_check_space__says_what_is_free_and_needed(tmp_path):
     check_space(tmp_path, 1, "files")
     with pytest.raises(OutputError, match=r"MB free, files may need 1,000,000,000,000.0 MB: free disk space"):
         check_space(tmp_path, 10**18, "files")
-
-
-def test_way_out__fits_the_error():
-    assert way_out(PermissionError()) == "choose another name or folder"
-    assert way_out(OSError(28, "No space left on device")) == "free disk space or choose another folder"

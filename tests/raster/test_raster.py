@@ -23,8 +23,8 @@ from rasterio.enums import ColorInterp
 from rasterio.errors import NotGeoreferencedWarning
 from rasterio.rpc import RPC
 from rasterio.transform import Affine
-from rio_cogeo.cogeo import cog_validate
 
+from sat_intervals.errors import InputError
 from sat_intervals.products import BANDS, FLAGS, INVALID, MASKED, NO_DATA
 from sat_intervals.raster import (
     POINT_FILES,
@@ -32,7 +32,6 @@ from sat_intervals.raster import (
     File,
     Georeferencing,
     Image,
-    InputError,
     OutputError,
     OutputWriter,
     check_pair,
@@ -140,17 +139,6 @@ def test_open_image__finds_a_relative_path_from_anywhere(tmp_path, monkeypatch):
     assert open_image("left.tif").path == str(tmp_path / "left.tif")
 
 
-def test_open_image__opens_the_file_that_the_system_finds_above_the_target_of_a_link(tmp_path, monkeypatch):
-    (tmp_path / "job" / "lists").mkdir(parents=True)
-    make(tmp_path / "left.tif", RAMP)
-    make(tmp_path / "job" / "left.tif", RAMP + 1)
-    (tmp_path / "lists").symlink_to("job/lists")
-    monkeypatch.chdir(tmp_path)
-    for name in ("lists/../left.tif", tmp_path / "lists" / ".." / "left.tif"):
-        image = open_image(name)
-        np.testing.assert_array_equal(read_window(image, whole(image))[0], RAMP + 1)
-
-
 @pytest.mark.parametrize("name", ["file://{}", "zip://{}!left.tif", "zip+file://{}!left.tif"])
 def test_files_of__a_name_of_rasterio_has_the_local_file(tmp_path, name):
     file = make(tmp_path / "left.tif", RAMP)
@@ -186,49 +174,28 @@ def test_open_image__refuses_what_is_no_image(tmp_path, name):
     message(failure, path, "cannot be read", "give the path of a raster")
 
 
-def test_open_image__says_what_the_system_says_of_a_missing_file(tmp_path):
-    with pytest.raises(InputError, match="No such file or directory"):
-        open_image(tmp_path / "missing.tif")
+REFUSED = {
+    "complex": (np.ones((3, 4), np.complex64), {}, {}, ("complex64", "amplitude")),
+    "several bands": (np.stack([RAMP, RAMP, RAMP]), {}, {}, ("3 bands", "1 to 3", "--band")),
+    "band below": (RAMP, {}, {"band": 0}, ("no image band 0", "band 1 only")),
+    "band above": (RAMP, {}, {"band": 2}, ("no image band 2", "band 1 only")),
+    "alpha band": (np.stack([RAMP, RAMP]), {"alpha": 2}, {"band": 2}, ("no image band 2", "band 1 only")),
+    "alpha alone": (RAMP, {"alpha": 1}, {}, ("no image band",)),
+}
 
 
-def test_open_image__refuses_complex_values(tmp_path):
-    path = make(tmp_path / "slc.tif", np.ones((3, 4), np.complex64))
+@pytest.mark.parametrize("kind", REFUSED)
+def test_open_image__refuses_what_cannot_be_matched(tmp_path, kind):
+    pixels, options, choice, parts = REFUSED[kind]
+    path = make(tmp_path / "left.tif", pixels, **options)
     with pytest.raises(InputError) as failure:
-        open_image(path)
-    message(failure, path, "complex64", "amplitude")
+        open_image(path, **choice)
+    message(failure, path, *parts)
 
 
-def test_open_image__needs_a_band_where_there_are_several(tmp_path):
-    path = make(tmp_path / "rgb.tif", np.stack([RAMP, RAMP + 100, RAMP + 200]))
-    with pytest.raises(InputError) as failure:
-        open_image(path)
-    message(failure, path, "3 bands", "1 to 3", "--band")
-    image = open_image(path, band=2)
+def test_open_image__takes_the_band_that_is_chosen(tmp_path):
+    image = open_image(make(tmp_path / "rgb.tif", np.stack([RAMP, RAMP + 100])), band=2)
     np.testing.assert_array_equal(read_window(image, whole(image))[0], RAMP + 100)
-
-
-@pytest.mark.parametrize("band", [-1, 0, 2])
-def test_open_image__refuses_a_band_out_of_range(tmp_path, band):
-    path = make(tmp_path / "left.tif", RAMP)
-    with pytest.raises(InputError) as failure:
-        open_image(path, band=band)
-    message(failure, path, f"no image band {band}", "band 1 only")
-
-
-def test_open_image__takes_an_alpha_band_for_a_mask_and_not_for_a_band(tmp_path):
-    path = make(tmp_path / "gray.tif", np.stack([RAMP, RAMP]), alpha=2)
-    image = open_image(path)
-    assert (image.band, image.alpha, image.use_mask) == (1, 2, False)
-    with pytest.raises(InputError) as failure:
-        open_image(path, band=2)
-    message(failure, path, "no image band 2", "band 1 only")
-
-
-def test_open_image__refuses_a_file_of_alpha_alone(tmp_path):
-    path = make(tmp_path / "alpha.tif", RAMP, alpha=1)
-    with pytest.raises(InputError) as failure:
-        open_image(path)
-    message(failure, path, "no image band")
 
 
 def test_open_image__refuses_a_mask_of_another_size(tmp_path):
@@ -236,14 +203,6 @@ def test_open_image__refuses_a_mask_of_another_size(tmp_path):
     with pytest.raises(InputError) as failure:
         open_image(path, mask=mask)
     message(failure, path, mask, "4 x 3", "3 x 4")
-
-
-@pytest.mark.parametrize("name", ["missing.tif", "text.tif"])
-def test_open_image__refuses_a_mask_that_is_no_image(tmp_path, name):
-    (tmp_path / "text.tif").write_text("no image\n")
-    with pytest.raises(InputError) as failure:
-        open_image(make(tmp_path / "left.tif", RAMP), mask=tmp_path / name)
-    message(failure, tmp_path / name)
 
 
 # Pairs
@@ -259,40 +218,29 @@ def test_check_pair__accepts_other_widths_and_origins(tmp_path):
     check_pair(*pair(tmp_path, RAMP, RAMP[:, :3], UTM, moved), 3)
 
 
-def test_check_pair__refuses_control_points_in_another_crs(tmp_path):
-    with pytest.raises(InputError, match="EPSG:4326 and EPSG:32631"):
-        check_pair(*pair(tmp_path, RAMP, RAMP, KINDS["gcps"], UTM), 3)
-
-
 @pytest.mark.parametrize("kind", ["none", "crs", "transform", "rpcs"])
 def test_check_pair__compares_what_both_images_have(tmp_path, kind):
     check_pair(*pair(tmp_path, left_options=KINDS[kind]), 3)
 
 
-def test_check_pair__refuses_other_heights(tmp_path):
+WIDE = Affine(0.7, 0, 0, 0, -0.5, 0)
+
+
+@pytest.mark.parametrize(
+    ("right", "options", "count", "part"),
+    [
+        (RAMP[:2], UTM, 3, "3 and 2 rows"),
+        (RAMP, {**UTM, "crs": "EPSG:32632"}, 3, "EPSG:32631 and EPSG:32632"),
+        (RAMP, KINDS["gcps"], 3, "EPSG:32631 and EPSG:4326"),
+        (RAMP, {"crs": "EPSG:32631", "transform": WIDE}, 3, "0.5 x 0.5 and 0.7 x 0.5"),
+        (RAMP, {"transform": WIDE}, 3, "0.5 x 0.5 and 0.7 x 0.5"),
+        (RAMP, UTM, 5, "4 columns, fewer than the 5 disparities"),
+    ],
+)
+def test_check_pair__refuses_images_that_do_not_correspond(tmp_path, right, options, count, part):
     with pytest.raises(InputError) as failure:
-        check_pair(*pair(tmp_path, RAMP, RAMP[:2]), 3)
-    message(failure, tmp_path / "left.tif", tmp_path / "right.tif", "3 and 2 rows")
-
-
-def test_check_pair__refuses_another_crs(tmp_path):
-    with pytest.raises(InputError) as failure:
-        check_pair(*pair(tmp_path, right_options={**UTM, "crs": "EPSG:32632"}), 3)
-    message(failure, tmp_path / "left.tif", tmp_path / "right.tif", "EPSG:32631 and EPSG:32632")
-
-
-@pytest.mark.parametrize("crs", ["EPSG:32631", None])
-def test_check_pair__refuses_another_pixel_size(tmp_path, crs):
-    wide = {"crs": crs, "transform": Affine(0.7, 0, 0, 0, -0.5, 0)}
-    with pytest.raises(InputError) as failure:
-        check_pair(*pair(tmp_path, right_options=wide), 3)
-    message(failure, tmp_path / "left.tif", tmp_path / "right.tif", "0.5 x 0.5 and 0.7 x 0.5")
-
-
-def test_check_pair__refuses_a_range_wider_than_the_image(tmp_path):
-    with pytest.raises(InputError) as failure:
-        check_pair(*pair(tmp_path), 5)
-    message(failure, tmp_path / "right.tif", "5 disparities", "4 columns")
+        check_pair(*pair(tmp_path, RAMP, right, UTM, options), count)
+    message(failure, tmp_path / "right.tif", part)
 
 
 # Windows
@@ -432,15 +380,6 @@ def test_read_window__names_a_file_cut_short_and_the_place(tmp_path, options):
     message(failure, path, "rows 240 to 299", "columns 100 to 149", "truncated")
 
 
-def test_read_window__names_a_mask_cut_short(tmp_path):
-    pixels = np.zeros((300, 200), np.uint16)
-    image = open_image(make(tmp_path / "left.tif", pixels), mask=make(tmp_path / "mask.tif", pixels))
-    os.truncate(image.mask, 1000)
-    with pytest.raises(InputError) as failure:
-        read_window(image, Window(240, 100, 10, 10))
-    message(failure, tmp_path / "mask.tif", "rows 240 to 249")
-
-
 def mosaic(folder: Path, side: int) -> Image:
     """Write a VRT of two images side by side, of which the right one has no file any more."""
     sources = ""
@@ -516,8 +455,6 @@ read_window(open_image(sys.argv[1]), Window(0, 0, 1500, 1500))"""
 @pytest.mark.parametrize(
     ("driver", "options", "setting"),
     [
-        ("GTiff", {}, {"GTIFF_DIRECT_IO": "YES"}),
-        ("GTiff", {"compress": "deflate", "tiled": True}, {"GTIFF_IGNORE_READ_ERRORS": "YES"}),
         ("JP2OpenJPEG", {"quality": 100, "reversible": "yes"}, {"GDAL_NUM_THREADS": "ALL_CPUS"}),
         ("PNG", {}, {}),
     ],
@@ -542,20 +479,10 @@ print(state.any(axis=1).tolist())"""
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("setting", [{"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR"}, {"GDAL_PAM_ENABLED": "NO"}])
-def test_read_window__sees_files_beside_an_image_whatever_the_users_options(tmp_path, setting):
-    path = tmp_path / "left.tif"
-    with rasterio.open(path, "w", "GTiff", 30, 20, 1, dtype="uint8", **UTM) as dataset:
-        dataset.write(np.full((20, 30), 7, np.uint8), 1)
-        masked = np.arange(20)[:, None].repeat(30, 1) < 5
-        if "GDAL_PAM_ENABLED" in setting:
-            dataset.write(np.where(masked, 9, 7).astype(np.uint8), 1)
-        else:
-            with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=False):
-                dataset.write_mask(~masked)
-    if "GDAL_PAM_ENABLED" in setting:
-        band = "<PAMRasterBand band='1'><NoDataValue>9</NoDataValue></PAMRasterBand>"
-        (tmp_path / "left.tif.aux.xml").write_text(f"<PAMDataset>{band}</PAMDataset>")
+def test_read_window__sees_a_mask_beside_an_image_whatever_the_users_options(tmp_path):
+    mask = np.arange(20)[:, None].repeat(30, 1) >= 5
+    path = make(tmp_path / "left.tif", np.full((20, 30), 7, np.uint8), external=mask)
+    setting = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR"}
     done = subprocess.run([sys.executable, "-c", STATE, path], env=os.environ | setting, capture_output=True, text=True)
     assert json.loads(done.stdout.lower()) == [True] * 5 + [False] * 15
 
@@ -590,10 +517,6 @@ def test_shifted__moves_transform_points_and_rpcs(tmp_path):
     rpcs = open_image(make(tmp_path / "c.tif", RAMP, **KINDS["rpcs"])).georeferencing.shifted(window).rpcs
     assert (rpcs.line_off, rpcs.samp_off) == (1970.25, 1214.5)
     assert (rpcs.lat_off, rpcs.line_scale, rpcs.line_num_coeff[1]) == (43.123456789, 2000, 0.333333333333333)
-
-
-def test_shifted__invents_nothing():
-    assert Georeferencing().shifted(Window(3, 4, 5, 6)) == Georeferencing()
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -655,17 +578,6 @@ def test_output_writer__keeps_the_georeferencing(tmp_path, products, kind):
         assert sorted(os.listdir(tmp_path / name)) == ["intervals.tif", "validity.tif"]
 
 
-@pytest.mark.parametrize("kind", ["none", "crs and transform", "gcps", "rpcs"])
-def test_output_writer__makes_cloud_optimized_geotiffs(tmp_path, products, kind):
-    produce(tmp_path, products, where=open_image(make(tmp_path / "left.tif", RAMP, **KINDS[kind])).georeferencing)
-    for name in ("intervals.tif", "validity.tif"):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            assert cog_validate(tmp_path / name, strict=True) == (True, [], [])
-        profile = look(tmp_path / name, lambda dataset: dataset.profile)
-        assert (profile["tiled"], profile["compress"]) == (True, "deflate")
-
-
 def test_output_writer__says_what_the_bands_are(tmp_path, products):
     produce(tmp_path, products, tags={"ALPHA": "0.9"})
     path = tmp_path / "intervals.tif"
@@ -693,20 +605,12 @@ def test_output_writer__says_what_the_flags_are(tmp_path, products):
         assert ("(invalid)" in tags[f"bit_{flag.bit:02}"]) is flag.invalid
 
 
-def test_output_writer__takes_overviews_from_pixels_as_they_are(tmp_path, products):
-    produce(tmp_path, products)
-    for name in ("intervals.tif", "validity.tif"):
-        full, half = look(tmp_path / name), look(tmp_path / name, overview_level=0)
-        np.testing.assert_array_equal(half, full[:, ::2, ::2])
-
-
 def left_behind(folder: Path) -> list[str]:
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
 
 
-@pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt])
 @pytest.mark.parametrize("built", [False, True])
-def test_output_writer__leaves_nothing_when_interrupted(tmp_path, products, error, built):
+def test_output_writer__leaves_nothing_when_interrupted(tmp_path, products, built):
     intervals, validity = products
 
     def interrupted() -> None:
@@ -715,15 +619,10 @@ def test_output_writer__leaves_nothing_when_interrupted(tmp_path, products, erro
             if built:
                 output.build()
             assert left_behind(tmp_path)
-            raise error
+            raise KeyboardInterrupt
 
-    with pytest.raises(error):
+    with pytest.raises(KeyboardInterrupt):
         interrupted()
-    assert left_behind(tmp_path) == []
-
-
-def test_output_writer__leaves_nothing_without_publish(tmp_path, products):
-    produce(tmp_path, products, publish=False)
     assert left_behind(tmp_path) == []
 
 
@@ -731,6 +630,7 @@ def test_output_writer__keeps_what_was_there_until_publish(tmp_path, products):
     (tmp_path / "intervals.tif").write_text("of the run before")
     produce(tmp_path, products, publish=False)
     assert (tmp_path / "intervals.tif").read_text() == "of the run before"
+    assert left_behind(tmp_path) == ["intervals.tif"]
     produce(tmp_path, products)
     np.testing.assert_array_equal(look(tmp_path / "intervals.tif"), products[0])
 
@@ -766,32 +666,6 @@ def test_output_writer__publishes_no_file_with_rows_that_were_not_written(tmp_pa
     assert left_behind(tmp_path) == []
 
 
-def test_output_writer__replaces_what_a_killed_run_left(tmp_path, products):
-    code = (
-        "import os, sys\nimport numpy as np\nfrom sat_intervals.raster import RUN_FILES, Georeferencing, OutputWriter\n"
-        "with OutputWriter(sys.argv[1], RUN_FILES, 600, 20, Georeferencing(), {}) as output:\n"
-        "    output.write(0, np.zeros((4, 600, 20), np.float32), np.zeros((600, 20), np.uint16))\n"
-        "    output.build()\n    os._exit(9)"
-    )
-    assert subprocess.run([sys.executable, "-c", code, tmp_path]).returncode == 9
-    assert left_behind(tmp_path) == [".intervals.tif.part", ".validity.tif.part"]
-    produce(tmp_path, products)
-    assert left_behind(tmp_path) == ["intervals.tif", "validity.tif"]
-    np.testing.assert_array_equal(look(tmp_path / "validity.tif")[0], products[1])
-
-
-def test_output_writer__builds_whole_files_under_temporary_names(tmp_path, products):
-    intervals, validity = products
-    with OutputWriter(tmp_path, RUN_FILES, HEIGHT, WIDTH, Georeferencing(), {}) as output:
-        output.write(0, intervals, validity)
-        made = output.build()
-        assert {name: path.parent for name, path in made.items()} == {file.name: tmp_path for file in RUN_FILES}
-        np.testing.assert_array_equal(look(made["validity.tif"])[0], validity)
-        assert not list(tmp_path.glob("[!.]*"))
-        output.publish()
-    assert left_behind(tmp_path) == ["intervals.tif", "validity.tif"]
-
-
 def test_output_writer__draws_pictures_with_their_tags_in_them(tmp_path):
     pixels = np.arange(60, dtype=np.uint8).reshape(6, 10)
     file = File("disparity.png", "uint8", None, BANDS[:1], driver="PNG")
@@ -811,7 +685,6 @@ def test_output_writer__draws_pictures_with_their_tags_in_them(tmp_path):
     [
         (3 << 20, 0, "has 3.1 MB free, files may need 3.5 MB"),
         (6 << 20, 0, "has 6.3 MB free, files may need 7.0 MB"),
-        (9 << 20, 0, "No space left on device"),
         (9 << 20, 1 << 20, "No space left on device"),
     ],
 )
@@ -830,6 +703,3 @@ def test_output_writer__leaves_nothing_on_a_full_disk(disk, products, size, othe
         fill()
     message(failure, place / "out", reason, "choose another folder")
     assert set(left_behind(place)) <= {"other", "out"}
-
-
-# The file has 527 kB. GDAL keeps its end until it is closed, and closes without an error what does not fit.

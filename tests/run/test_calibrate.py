@@ -1,7 +1,6 @@
 """Calibrations of demo scenes: through the engine, against runs with them, and from mistaken inputs."""
 
 import dataclasses
-import itertools
 import json
 from shutil import copytree
 
@@ -19,7 +18,7 @@ from sat_intervals.config import candidates as compared
 from sat_intervals.config.calibration import COVERAGES
 from sat_intervals.config.candidates import candidates
 from sat_intervals.demo import make_scene
-from sat_intervals.errors import ChangedInputError
+from sat_intervals.errors import ChangedInputError, InputError
 from sat_intervals.evaluate.disparity import evaluate_run
 from sat_intervals.match import measurement
 from sat_intervals.raster import OutputError, write_layer
@@ -378,35 +377,8 @@ def test_tune__match_takes_the_file(scene, tmp_path, monkeypatch):
     assert used["interval"]["calibration"]["name"] == "stronger"
 
 
-def test_tune__ends_where_a_truth_is_lost_while_the_last_settings_are_tried(scene, tmp_path, monkeypatch):
-    """Else these would be left out, and others be the best."""
-    (tmp_path / "pair").mkdir()
-    with rasterio.open(scene / "truth.tif") as file:
-        pair = with_truth(scene, tmp_path / "pair", file.read(1))
-    monkeypatch.setattr(
-        "sat_intervals.config.candidates.candidates",
-        lambda own, with_network: [("one", None), ("last", {"sgm": {"p2": 64}})],
-    )
-    monkeypatch.setattr(measurement, "_RUNGS", 5)  # the levels do not matter here
-    tuned, calls = tune.tuned, itertools.count()
-
-    def and_lost(*arguments):
-        is_last = next(calls) > 0
-
-        def progress(stage, done, total):
-            if is_last and stage == "tiles":
-                (pair / "truth.tif").unlink(missing_ok=True)
-
-        return tuned(*arguments[:-1], progress)
-
-    monkeypatch.setattr(tune, "tuned", and_lost)
-    result = invoke("calibrate", pair, "--tune", "--output", tmp_path / "tuned.yaml", "--quiet")
-    assert (result.exit_code, "truth.tif cannot be read" in result.stderr) == (2, True), result.output
-    assert not (tmp_path / "tuned.yaml").exists()
-
-
-@pytest.mark.parametrize("error", [StoreError, OutputError])
-def test_tune__ends_where_the_disk_is_full(scene, tmp_path, monkeypatch, error):
+@pytest.mark.parametrize("error", [StoreError, OutputError, InputError])
+def test_tune__ends_where_other_settings_would_not_help(scene, tmp_path, monkeypatch, error):
     def full(*arguments):
         raise error("no space")
 

@@ -14,8 +14,7 @@ from sat_intervals import match_arrays, match_pair
 from sat_intervals.config import load_calibration, load_config
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.products import INVALID, NO_DATA
-from sat_intervals.raster import open_image, read_window
+from sat_intervals.products import INVALID
 from sat_intervals.results import open_run
 from sat_intervals.run import pair as run
 from sat_intervals.run.job import prepare
@@ -85,20 +84,6 @@ def test_match_pair__subpixel_bounds_in_tiles_equal_those_of_arrays(pair, tmp_pa
     assert tags["CALIBRATION"] == f"flat {report['calibration']['sha256']}"
     assert tags["COVERAGE"].startswith("0.8 (")
     assert "ALPHA" not in tags
-
-
-def test_match_pair__another_calibration_does_not_resume_tiles(pair, tmp_path):
-    left, right, settings = pair
-    key = load_config(settings)
-
-    def job(low):
-        interval = {"coverage": 0.9, "calibration": calibration(key, 36, low, 0.9)}
-        return prepare(left, right, tmp_path / "out", in_tiles(settings, 64, interval=interval))
-
-    job(12).begin()
-    with pytest.raises(SatIntervalsError, match="--overwrite"):
-        job(13).begin()
-    job(12).begin()
 
 
 def test_match_pair__warns_of_images_without_texture(pair, tmp_path, caplog):
@@ -232,21 +217,6 @@ def test_match_pair__goes_on_from_the_tiles_that_are_done(pair, tmp_path, monkey
     assert hashes(tmp_path / "undisturbed") == hashes(tmp_path / "out")
 
 
-def test_match_pair__names_what_differs_from_the_tiles_elsewhere_and_removes_them(pair, tmp_path):
-    left, right, settings = pair
-    store, out = tmp_path / "store", tmp_path / "out"
-    settings = in_tiles(settings, 64) | {"cluster": {"store": str(store)}}
-    match_pair(left, right, out, settings, keep_tiles=True)
-    (place,) = store.iterdir()
-    (out / "run.json").unlink()
-    other = settings | {"sgm": {"p1": 7, "p2": 32}}
-    with pytest.raises(SatIntervalsError, match=r"holds the tiles of another run: .*settings\.sgm\.p1 was 8, now 7"):
-        match_pair(left, right, out, other)
-    assert list(store.iterdir()) == [place]
-    match_pair(left, right, out, other, overwrite=True)
-    assert not list(store.iterdir())
-
-
 def test_digest__tells_what_differences_tell(tmp_path):
     manifest = {"settings": {"p": 1}, "inputs": {"left": {"sha256": "a", "modified": "today"}, "files": [{"bytes": 3}]}}
     later = {"inputs": {"files": [{"bytes": 3}], "left": {"modified": "now", "sha256": "a"}}, "settings": {"p": 1}}
@@ -280,13 +250,6 @@ def test_match_pair__says_which_image_is_empty(pair, tmp_path):
     with pytest.raises(SatIntervalsError, match=r"empty\.tif are no data"):
         match_pair(left, empty, tmp_path / "out", settings)
     assert not list((tmp_path / "out").glob("[a-z]*.*"))
-
-
-def test_read_window__of_an_opened_image_gives_states(pair):
-    image = open_image(pair[0])
-    pixels, state = read_window(image, Window(-2, -2, 4, 4))
-    assert pixels.shape == state.shape == (4, 4)
-    assert (state[:2] == NO_DATA).all()
 
 
 def test_match_pair__tiles_equal_one_tile_on_a_real_pair(shared_data, tmp_path):

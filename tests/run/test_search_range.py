@@ -9,7 +9,6 @@ import pytest
 import rasterio
 from helpers import PLACE, bands, invoke, write_pair
 from matplotlib.image import imread
-from rio_cogeo.cogeo import cog_validate
 
 from sat_intervals import RunError, SatIntervalsError, match_pair, open_image
 from sat_intervals.demo import make_scene
@@ -116,14 +115,6 @@ def test_read_ranges__takes_the_hull_of_a_cell_rounded_outwards(folder, tmp_path
         read_ranges(str(file), left)
 
 
-def test_range__writes_a_cloud_optimized_raster(folder, tmp_path):
-    pair, file = (folder / "left.tif", folder / "right.tif"), tmp_path / "ranges.tif"
-    assert invoke("range", *pair, "--output", file).exit_code == 0
-    assert cog_validate(file, strict=True) == (True, [], [])
-    with rasterio.open(file) as dataset:
-        assert dataset.descriptions == ("minimum", "maximum")
-
-
 def test_match__warns_of_ranges_of_another_left_image(folder, tmp_path):
     images, file = (folder / "left.tif", folder / "right.tif"), tmp_path / "range.tif"
     assert invoke("range", *images, "--output", file, "-q").exit_code == 0
@@ -171,18 +162,6 @@ def test_range__keeps_inputs_and_files_of_others(folder, tmp_path):
     result = invoke("range", *images, "--output", tmp_path / "other.tif")
     assert (result.exit_code, "other.tif exists: choose another name" in result.stderr) == (2, True)
     assert invoke("range", *images, "--output", tmp_path / "other.tif", "--overwrite").exit_code == 0
-
-
-def test_match__keeps_the_raster_of_ranges(folder, tmp_path):
-    grid = tmp_path / "tiles/range.tif"
-    grid.parent.mkdir()
-    write_bands(grid, *np.stack([np.full((130, 300), -5), np.full((130, 300), 5)]))
-    result = invoke(
-        "match", folder / "left.tif", folder / "right.tif", tmp_path, "--set", f"disparity.grid={grid}", "--overwrite"
-    )
-    assert result.exit_code == 2
-    assert "is an input" in result.stderr
-    assert grid.exists()
 
 
 def test_match__names_a_wider_range_and_is_strict(folder, tmp_path):

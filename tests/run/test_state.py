@@ -165,8 +165,9 @@ def test_match__with_tiles_elsewhere_names_where_they_are(scene, tmp_path):
     succeeds(scene, tmp_path / "out", *stores[0], "--keep-tiles")
     (tmp_path / "out" / "run.json").unlink()
     refused(command(scene, tmp_path / "out", *stores[1]), "place was ", "first", "second")
-    succeeds(scene, tmp_path / "out", *stores[0])
-    assert not list((tmp_path / "first").iterdir())
+    assert list((tmp_path / "first").iterdir())
+    succeeds(scene, tmp_path / "out", *stores[1], "--overwrite")
+    assert not [*(tmp_path / "first").iterdir(), *(tmp_path / "second").iterdir()]
     assert sorted(file.name for file in (tmp_path / "out").iterdir()) == sorted([".sat-intervals.lock", *OUTPUTS])
 
 

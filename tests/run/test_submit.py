@@ -9,14 +9,13 @@ from contextlib import suppress
 import dask
 import psutil
 import pytest
-from distributed import Client, KilledWorker, LocalCluster, wait
+from distributed import Client, KilledWorker, LocalCluster
 from helpers import wait_until
 
 from sat_intervals.config import Cluster
 from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.run import cluster, submit
-from sat_intervals.run.cluster import connected
-from sat_intervals.run.submit import DaskWorkers
+from sat_intervals.run import submit
+from sat_intervals.run.submit import DaskWorkers, connected
 from sat_intervals.run.workers import Task, reason
 
 pytestmark = pytest.mark.process
@@ -62,7 +61,7 @@ def test_outcomes__an_error_of_the_disk_is_one_of_its_task():
 
 
 def test_outcomes__a_task_that_kills_every_worker_fails(tmp_path, monkeypatch):
-    monkeypatch.setitem(cluster.DASK, "distributed.scheduler.allowed-failures", 1)
+    monkeypatch.setitem(submit.DASK, "distributed.scheduler.allowed-failures", 1)
     with connected(Cluster(kind="processes", workers=1), tmp_path) as client:
         (outcome,) = ended(client, Task(0, os._exit, (3,), 2))
     assert isinstance(outcome.error, KilledWorker)
@@ -78,29 +77,11 @@ def test_outcomes__go_on_when_workers_are_killed_as_they_start(tmp_path):
 
 
 def test_outcomes__go_on_without_a_worker_that_is_stopped(tmp_path, monkeypatch):
-    monkeypatch.setitem(cluster.DASK, "distributed.scheduler.worker-ttl", "6s")
+    monkeypatch.setitem(submit.DASK, "distributed.scheduler.worker-ttl", "6s")
     with connected(Cluster(kind="processes", workers=2), tmp_path) as client:
         psutil.Process(min(client.run(os.getpid).values())).send_signal(signal.SIGSTOP)
         outcomes = ended(client, *(Task(n, abs, (-n,), 2) for n in range(9)))
     assert sorted((end.label, end.result) for end in outcomes) == [(n, n) for n in range(9)]
-
-
-def test_outcomes__say_none_while_a_result_that_left_with_its_worker_is_computed_again(monkeypatch):
-    outcome, left = submit._outcome, []
-    with in_threads() as local, Client(local) as client:
-
-        async def after_its_worker_left(label, future):
-            await wait(future)
-            left.extend(local.workers.values())
-            await left[0].close()
-            threading.Timer(5, local.scale, [2]).start()
-            return await outcome(label, future)
-
-        monkeypatch.setattr(submit, "_outcome", after_its_worker_left)
-        *meanwhile, last = DaskWorkers(client).outcomes(iter([Task(0, abs, (-3,), 0)]))
-    assert (last.result, last.error, len(left)) == (3, None, 1)
-    assert len(meanwhile) > 1
-    assert {*meanwhile} == {None}
 
 
 def test_outcomes__end_when_the_scheduler_is_lost():

@@ -21,7 +21,6 @@ import yaml
 from distributed import Client, LocalCluster
 from helpers import COMMAND, OUTPUTS, PATIENCE, PLACE, wait_until, write_pair
 
-from sat_intervals import match_pair
 from sat_intervals.demo import make_scene
 from sat_intervals.raster import write_layer
 from sat_intervals.run import pair as run
@@ -32,16 +31,6 @@ from sat_intervals.store.lock import locked
 pytestmark = pytest.mark.process
 
 TILES = 56
-
-
-@pytest.fixture(scope="module")
-def blocks(tmp_path_factory):
-    """A pair whose tiles are traced and matched in blocks of 2 x 2, and an undisturbed run of one tile."""
-    folder = tmp_path_factory.mktemp("blocks")
-    settings = write_pair(folder, make_scene(520, 520, seed=4), tiles={"size": 64})
-    whole = settings | {"tiles": {"size": 576}}
-    match_pair(folder / "left.tif", folder / "right.tif", folder / "undisturbed", whole)
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -156,24 +145,6 @@ def test_match__survives_kill_9_of_workers_at_random_moments(pair, tmp_path):
             re.sub(r".*resource_tracker.*\n.*\n", "", command.output) == ""
         )  # Python's word on what a killed one held
     assert_complete(pair, tmp_path / "out")
-
-
-def test_match__of_blocks_of_tiles_survives_kill_9_in_both_phases(blocks, tmp_path):
-    chance, out, options = random.Random(3), tmp_path / "out", ("--cluster", "processes", "--workers", "2")
-    with started(blocks, out, *options) as command:
-        for count in (3, 30):
-            command.wait_for_borders(count)
-            kill(chance.choice(command.workers()))
-        command.wait_for_tiles(9)
-        kill(chance.choice(command.workers()))
-        command.wait_for_tiles(14)
-        command.kill()
-    assert_nothing_final(out)
-    with started(blocks, out, *options) as command:
-        command.wait_for_tiles(40)
-        kill(chance.choice(command.workers()))
-        assert command.end() == 0, command.output
-    assert_complete(blocks, out)
 
 
 def test_match__goes_on_after_kill_9_of_the_command(pair, tmp_path):

@@ -1,17 +1,16 @@
-"""Nothing waits forever: JSON and YAML without end, images and files that are too large."""
+"""Nothing waits forever: YAML without end, images and files that are too large."""
 
-import json
 import subprocess
 import time
 
 import numpy as np
 import pytest
 import rasterio
-from helpers import COMMAND, invoke
+from helpers import COMMAND
 
 from sat_intervals import load_config
 from sat_intervals.config import ConfigError, Mccnn
-from sat_intervals.config.pairs import find_pairs, read_batch
+from sat_intervals.config.pairs import read_batch
 from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import SatIntervalsError
 
@@ -21,16 +20,6 @@ def write(path, **options):
     with rasterio.open(path, "w", transform=rasterio.Affine(1, 0, 3e5, 0, -1, 4e6), **profile | options) as file:
         file.write(np.ones((9, 9), np.uint8), 1)
     return path
-
-
-@pytest.mark.parametrize("name", ["run.json", "batch.json", "meta.json"])
-def test_commands__refuse_json_that_is_nested_without_end(tmp_path, name):
-    for file in (name, "left.tif", "right.tif", "truth.tif"):
-        (tmp_path / file).write_text(100_000 * "[")
-    command = {"run.json": "report", "batch.json": "status", "meta.json": "ablate"}[name]
-    result = invoke(command, tmp_path)
-    assert result.exit_code == 2, result.stderr
-    assert name in result.stderr
 
 
 # ---- YAML --------------------------------------------------------------------------------------------------------
@@ -69,20 +58,6 @@ def test_read_small__refuses_a_large_file(tmp_path):
     for read in (load_config, read_batch):
         with pytest.raises(SatIntervalsError, match=r"settings.yaml has more than 1 MB: is it the right file\?$"):
             read(file)
-
-
-@pytest.mark.parametrize("read", [read_batch, lambda file: find_pairs([file])])
-def test_read_small__refuses_a_large_table(tmp_path, read):
-    file = tmp_path / "pairs.csv"
-    file.write_bytes(b"name,left,right\n" + 2_000_000 * b"a,b,c\n")
-    with pytest.raises(SatIntervalsError, match=r"pairs.csv has more than 10 MB: is it the right file\?$"):
-        read(file)
-
-
-def test_read_batch__takes_a_list_of_thousands_of_pairs(tmp_path):
-    file = tmp_path / "pairs.json"
-    file.write_text(json.dumps([{"name": f"p{i}", "left": "a", "right": "b"} for i in range(2000)]))
-    assert len(read_batch(file)) == 2000
 
 
 # ---- Sizes -------------------------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from helpers import hashes, wait_until, write_pair
@@ -12,8 +13,8 @@ from helpers import hashes, wait_until, write_pair
 from sat_intervals import match_pair
 from sat_intervals.config import Cluster
 from sat_intervals.demo import make_scene
-from sat_intervals.run import cluster, source, tile, workers
-from sat_intervals.run.connection import connected
+from sat_intervals.run import source, submit, tile, workers
+from sat_intervals.run.connection import Connection
 from sat_intervals.run.workers import Task, Threads
 
 
@@ -26,7 +27,7 @@ def test_threads__yield_every_outcome_and_try_again():
             raise OSError("disk gone")
         return number**2
 
-    with connected(Cluster(workers=2), None) as threads:
+    with Connection(Cluster(workers=2), Path()) as threads:
         outcomes = {outcome.label: outcome for outcome in threads.outcomes(Task(n, work, (n,), 2) for n in range(5))}
     assert {label: outcome.result for label, outcome in outcomes.items()} == {0: 0, 1: 1, 2: 4, 3: None, 4: 16}
     assert str(outcomes[3].error) == "disk gone"
@@ -42,7 +43,7 @@ def test_threads__take_a_task_once_another_has_made_it_ready():
             yield None
         yield Task(1, ended.append, (1,), 0)
 
-    with connected(Cluster(workers=4), None) as threads:
+    with Connection(Cluster(workers=4), Path()) as threads:
         assert [outcome.label for outcome in threads.outcomes(tasks())] == [0, 1]
     assert ended == [0, 1]
 
@@ -78,7 +79,7 @@ def test_threads__need_neither_dask_nor_xarray(module):
 @pytest.mark.process
 @pytest.mark.parametrize(("store", "threads"), [(None, 1), ("memory://tiles", 2)])
 def test_connected__gives_processes_a_thread_that_reads_and_writes_tiles_in_a_bucket(tmp_path, store, threads):
-    with cluster.connected(Cluster(kind="processes", workers=1, store=store), tmp_path) as client:
+    with submit.connected(Cluster(kind="processes", workers=1, store=store), tmp_path) as client:
         assert list(client.nthreads().values()) == [threads]
 
 

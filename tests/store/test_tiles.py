@@ -104,7 +104,8 @@ def test_tables__sum_over_all_tiles(written):
 def test_strips__delete_and_name_damaged_tiles(written, how):
     store, _ = written
     for name in ("0_1", "1_0"):
-        content = store.folder.read(f"{TILES}/{name}.npz")
+        with store.folder.opened(f"{TILES}/{name}.npz") as file:
+            content = file.read()
         store.delete(TILES, [name])
         if DAMAGES[how]:
             store.folder.write(f"{TILES}/{name}.npz", DAMAGES[how](content))
