@@ -27,6 +27,7 @@ PAGES = ROOT / "build" / "docs"
 CAMERAS = "--left-model demo/left_model.tif --right-model demo/right_model.tif"
 GRIDS = "--left-grid demo/left_grid.tif --right-grid demo/right_grid.tif"
 COMPARED = "--dsm demo/dsm.tif --reference demo/lidar.tif"
+LOCAL = "--set disparity.local=true"
 # Commands of the gallery, run in the folder of its pictures: title, command, what it shows.
 GALLERY = (
     ("A scene with exact truth", "sat-intervals demo demo --size 700 700", None),
@@ -43,7 +44,7 @@ GALLERY = (
     ("Its heights and half widths", "sat-intervals plot demo --dpi 90", "demo/dsm.png"),
     ("Its errors", f"sat-intervals evaluate {COMPARED} --pictures demo --overwrite", "demo/dsm-errors.png"),
     ("A line across it", f"sat-intervals evaluate {COMPARED} --pictures demo --overwrite", "demo/dsm-profile.png"),
-    ("A relief, with local search ranges", "sat-intervals demo relief --size 500 500 --relief 60 --set disparity.local=true", None),
+    ("A relief, with local ranges", f"sat-intervals demo relief --size 500 500 --relief 60 {LOCAL}", None),
     ("Its maps", "sat-intervals plot relief --dpi 90", "relief/overview.png"),
 )  # fmt: skip
 
