@@ -8,19 +8,19 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.calibrate_dsm import calibrate_heights, check_alone
+from sat_intervals.cli.calibrate_dsm import calibrate_heights
 from sat_intervals.cli.calibration_files import check_output, write
 from sat_intervals.cli.judging import find_sources, tolerance_option
 from sat_intervals.cli.matching import SettingsArguments, settings_options
 from sat_intervals.cli.options import (
     FILE,
-    SurfaceAndReference,
+    Surface,
     json_option,
     log_options,
     overwrite_option,
     quiet_option,
-    reference_options,
     say_json,
+    surface_options,
 )
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ _SETTINGS = """\
 @click.option(
     "--tune", is_flag=True, help="Compare presets and penalties; write the best as settings for match --config."
 )
-@reference_options("Calibrate this surface model against --reference, instead of pairs.")
+@surface_options("Calibrate this surface model against --reference, instead of pairs.", "pairs", "coverage")
 @json_option
 @click.option(
     "--coverage",
@@ -72,7 +72,7 @@ def calibrate(
     truth: tuple[Path, ...],
     name: str | None,
     tune: bool,
-    surface: SurfaceAndReference | None,
+    surface: Surface | None,
     coverage: float | None,
     settings: SettingsArguments,
     as_json: bool,
@@ -96,13 +96,10 @@ def calibrate(
     heights of --reference (its own coverage, or --coverage). Use FILE with: dsm --calibration FILE.
     """
     if surface is not None:
-        check_alone(pairs, settings, {"truth": truth, "tune": tune, **judging})
         calibrate_heights(surface, output, name, coverage, overwrite=overwrite, as_json=as_json, quiet=quiet)
         return
     if not pairs:
         raise click.UsageError("give PAIRS, or --dsm and --reference.")
-    if coverage is not None:
-        raise click.UsageError("--coverage applies only with --dsm: leave it out.")
     from sat_intervals.cli.console import Console
     from sat_intervals.cli.tables import show_calibration
     from sat_intervals.run.calibrate import calibration_from, check_subjects

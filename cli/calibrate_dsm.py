@@ -1,14 +1,12 @@
 """Calibrate the intervals of a surface model: ``sat-intervals calibrate --dsm``."""
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from sat_intervals.cli.calibration_files import check_output, write
-from sat_intervals.cli.matching import SettingsArguments
-from sat_intervals.cli.options import SurfaceAndReference, say_json
+from sat_intervals.cli.options import Surface, say_json
 
 if TYPE_CHECKING:
     from sat_intervals.config import HeightCalibration
@@ -20,17 +18,8 @@ _HEIGHTS = """\
 """
 
 
-def check_alone(pairs: Sequence[Path], settings: SettingsArguments, options: Mapping[str, Any]) -> None:
-    """Raise if there are pairs to calibrate too, or options for them."""
-    if pairs:
-        raise click.UsageError(f"{pairs[0]} is a pair and --dsm a surface model: calibrate one of them at a time.")
-    given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value]
-    for option in (*settings.options, *given):
-        raise click.UsageError(f"{option} applies to pairs, not to --dsm: leave it out.")
-
-
 def calibrate_heights(
-    surface: SurfaceAndReference,
+    surface: Surface,
     output: Path,
     name: str | None,
     coverage: float | None,

@@ -52,8 +52,6 @@ def demo(
     from sat_intervals.demo import PIXEL, make_scene
     from sat_intervals.evaluate.disparity import evaluate_run
     from sat_intervals.raster import north_up
-    from sat_intervals.raster.identity import check_not_replaced
-    from sat_intervals.run.state import OUTPUTS
 
     layers = [out / f"{name}.tif" for name in ("left", "right", "truth")]
     somewhere, nodata = north_up(32631, x=370_000, y=4_830_000, pixel=PIXEL), (0, 0, float("nan"))
@@ -61,7 +59,7 @@ def demo(
         console.progress("scene", 0, 1)
         scene = make_scene(*size, seed=seed, relief=relief)
         config = settings.load(disparity={"minimum": scene.minimum, "maximum": scene.maximum})
-        check_not_replaced([settings.file], [*layers, *(out / name for name in OUTPUTS)], [out / "tiles"])
+        settings.check_kept(out, *layers)
         for path, pixels, value in zip(layers, (scene.left, scene.right, scene.truth), nodata, strict=True):
             _write(path, pixels, value, somewhere, overwrite=run.overwrite)
         console.progress("scene", 1, 1)

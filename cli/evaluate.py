@@ -6,13 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.evaluate_dsm import Surface, surface_options
+from sat_intervals.cli.evaluate_dsm import Details, details_options, evaluate_heights
 from sat_intervals.cli.judging import Judging, Source, find_sources, judging_options, say_scenes
-from sat_intervals.cli.options import FILE
+from sat_intervals.cli.options import FILE, Surface, surface_options
 
 if TYPE_CHECKING:
     from sat_intervals.config import Config
-    from sat_intervals.evaluate.paper import SceneMetrics
 
 
 @click.command(short_help="Evaluate intervals against a known truth.")
@@ -21,7 +20,12 @@ if TYPE_CHECKING:
 @click.option("--mask", type=FILE, multiple=True, help="Pixels to evaluate (not 0); one for each OUT, in that order.")
 @click.option("--remove-bias", is_flag=True, help="Add the median of disparity - truth to the truth first.")
 @click.option("--group", metavar="LABEL", help="Put all scenes in this group; ignore meta.json.")
-@surface_options
+@surface_options(
+    "Evaluate this surface model against --reference, instead of runs.",
+    "runs and pairs",
+    *("classes", "pictures", "line", "overwrite"),
+)
+@details_options
 @judging_options
 def evaluate(
     folders: tuple[Path, ...],
@@ -30,6 +34,7 @@ def evaluate(
     remove_bias: bool,
     group: str | None,
     surface: Surface | None,
+    details: Details,
     judging: Judging,
 ) -> None:
     """Evaluate the intervals of the runs in the folders OUT against the truth of their left images.
@@ -51,10 +56,7 @@ def evaluate(
     the surface; figures of all cells are printed before and after that.
     """
     if surface:
-        others = {"--truth": truth, "--mask": mask, "--remove-bias": remove_bias, "--group": group}
-        others |= {"--tolerance": judging.tolerance, **dict.fromkeys(judging.settings.options, True)}
-        surface.check_alone(folders, others)
-        surface.evaluate(judging.as_json, judging.quiet)
+        evaluate_heights(surface, details, as_json=judging.as_json, quiet=judging.quiet)
         return
     if not folders:
         raise click.UsageError("Missing argument 'OUT...'.")
@@ -69,21 +71,15 @@ def evaluate(
             click.echo(f"matching {source.name}", err=True)
         report = _evaluated(source, config, tolerance=judging.tolerance, remove_bias=remove_bias)
         scenes.append(SceneMetrics(source.name, group or _group(source), report))
-    if not judging.quiet:
-        _warn_of_whole_truth(scenes, judging.tolerance)
+    names = [scene.name for scene in scenes if scene.report["truth_is_whole"]]
+    if names and not judging.tolerance and not judging.quiet:  # such a truth may be wrong by half a pixel
+        click.echo(f"warning: the truth of {', '.join(names)} has whole pixels only: try --tolerance 0.5", err=True)
     if judging.as_json:
         say_scenes(scenes)
     elif len(scenes) == 1:
         show_scene(scenes[0])
     else:
         show_scenes(scenes)
-
-
-def _warn_of_whole_truth(scenes: "list[SceneMetrics]", tolerance: float) -> None:
-    """Suggest a tolerance for truths of whole pixels, which may be wrong by half a pixel."""
-    names = [scene.name for scene in scenes if scene.report["truth_is_whole"]]
-    if names and not tolerance:
-        click.echo(f"warning: the truth of {', '.join(names)} has whole pixels only: try --tolerance 0.5", err=True)
 
 
 def _configs(sources: list[Source], judging: Judging) -> "list[Config | None]":

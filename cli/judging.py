@@ -1,16 +1,15 @@
 """What the commands share that compare with a known truth: pairs and runs, options, reports."""
 
-import math
 from collections.abc import Sequence
+import math
 from dataclasses import dataclass
-from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from sat_intervals.cli.matching import SettingsArguments, settings_options
-from sat_intervals.cli.options import Command, json_option, log_options, say_json, with_options
+from sat_intervals.cli.options import Command, gathered, json_option, log_options, say_json
 
 if TYPE_CHECKING:
     from sat_intervals.config import Config
@@ -18,19 +17,17 @@ if TYPE_CHECKING:
     from sat_intervals.evaluate.paper import SceneMetrics
 
 
-def finite(context: click.Context, parameter: click.Parameter, value: float) -> float:
-    """Raise if a number of pixels is infinite or NaN."""
+def _finite(context: click.Context, parameter: click.Parameter, value: float) -> float:
+    """Raise if a number of pixels is infinite or NaN, which no range of click refuses."""
     if not math.isfinite(value):
         raise click.BadParameter(f"{value} is not a number of pixels")
     return value
 
 
+TOLERANCE: dict[str, Any] = {"type": click.FloatRange(min=0), "default": 0.0, "callback": _finite, "metavar": "PX"}
 tolerance_option = click.option(
     "--tolerance",
-    type=click.FloatRange(min=0),
-    default=0.0,
-    callback=finite,
-    metavar="PX",
+    **TOLERANCE,
     help="Truth up to PX outside an interval counts as inside; for quantised truth, give half a step.",
 )
 
@@ -53,20 +50,9 @@ class Judging:
 
 def judging_options(command: Command) -> Command:
     """Add the options of commands that evaluate pairs with known truth; the command gets ``judging``, a `Judging`."""
-
-    @wraps(command)
-    def with_judging(
-        *, settings: SettingsArguments, tolerance: float, as_json: bool, quiet: bool, **others: Any
-    ) -> Any:
-        return command(judging=Judging(settings, tolerance, as_json, quiet), **others)
-
-    return with_options(
-        settings_options(with_judging),
-        tolerance_option,
-        json_option,
-        click.option("--quiet", "-q", is_flag=True, help="Print figures and errors only."),
-        log_options,
-    )
+    quiet_option = click.option("--quiet", "-q", is_flag=True, help="Print figures and errors only.")
+    with_judging = gathered("judging", Judging, tolerance_option, json_option, quiet_option)
+    return settings_options(with_judging(log_options(command)))
 
 
 @dataclass(frozen=True)

@@ -36,18 +36,15 @@ def match(
     rerun the same command.
     """  # noqa: D301 (click's mark of a preformatted paragraph)
     from sat_intervals.cli.console import Console
-    from sat_intervals.raster.identity import check_not_replaced
 
+    config = settings.load()
     if dry_run:
         from sat_intervals.run.batch_system import job_script
 
-        click.echo(job_script(settings.load().cluster, out))
+        click.echo(job_script(config.cluster, out))
         return
-    config = settings.load()
     with Console(run.quiet or as_json) as console:
-        from sat_intervals.run.state import OUTPUTS
-
-        check_not_replaced([settings.file], [out / name for name in OUTPUTS], [out / "tiles"])
+        settings.check_kept(out)
         left, right = pair.open()
         report = run.match(left, right, out, config, window=pair.window, progress=console.progress)
     if as_json:

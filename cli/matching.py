@@ -11,9 +11,10 @@ import click
 from sat_intervals.cli.options import (
     FILE,
     NAME,
+    PRESETS,
     Command,
+    gathered,
     log_options,
-    preset_option,
     quiet_option,
     with_options,
 )
@@ -64,6 +65,13 @@ class SettingsArguments:
 
         return load_config(load_config(self.file, self.sections), sections)
 
+    def check_kept(self, out: Path, *others: Path) -> None:
+        """Raise if a run in the folder ``out``, or another file that is written, would replace the file of settings."""
+        from sat_intervals.raster.identity import check_not_replaced
+        from sat_intervals.run.state import OUTPUTS
+
+        check_not_replaced([self.file], [*(out / name for name in OUTPUTS), *others], [out / "tiles"])
+
 
 @dataclass(frozen=True)
 class RunArguments:
@@ -83,13 +91,7 @@ class RunArguments:
         return match_pair(left, right, out, config, keep_tiles=self.keep_tiles, overwrite=self.overwrite, **more)
 
     def check_strict(self, warnings: Sequence[str]) -> None:
-        """Raise if the run has warned and must not.
-
-        Raises
-        ------
-        RunError
-            With the number of warnings; their lines have been printed.
-        """
+        """Raise if the run has warned, in lines that were printed, and must not."""
         if self.strict and warnings:
             from sat_intervals.errors import RunError
 
@@ -112,7 +114,28 @@ class _Both(click.ParamType):  # type: ignore[type-arg,unused-ignore]
         return left, right_or_left
 
 
-_IMAGE_OPTIONS = (
+def _pair(
+    *,
+    left: str,
+    right: str,
+    left_mask: str | None,
+    right_mask: str | None,
+    nodata: tuple[float, float] | None,
+    band: tuple[int, int] | None,
+    window: tuple[int, int, int, int] | None,
+) -> PairArguments:
+    from sat_intervals.tiling import Window
+
+    nothing, region = (None, None), Window(*window) if window else None
+    return PairArguments((left, right), (left_mask, right_mask), nodata or nothing, band or nothing, region)
+
+
+# The command gets ``pair``.
+pair_options = gathered(
+    "pair",
+    _pair,
+    click.argument("left", type=NAME),
+    click.argument("right", type=NAME),
     click.option("--left-mask", type=NAME, help="Mask of the left image: non-zero = masked."),
     click.option("--right-mask", type=NAME, help="Mask of the right image."),
     click.option(
@@ -122,44 +145,12 @@ _IMAGE_OPTIONS = (
         help="No-data value of both images, or LEFT,RIGHT; replaces that of the files.",
     ),
     click.option("--band", type=_Both(int), metavar="N", help="Band to match in both images, or LEFT,RIGHT."),
-)
-
-
-def pair_options(command: Command) -> Command:
-    """Add the arguments LEFT and RIGHT, and options to read them; the command gets ``pair``, a `PairArguments`."""
-
-    @wraps(command)
-    def with_pair(*, left: str, right: str, window: tuple[int, int, int, int] | None, **others: Any) -> Any:
-        from sat_intervals.tiling import Window
-
-        masks = others.pop("left_mask"), others.pop("right_mask")
-        nodata, band = (others.pop(name) or (None, None) for name in ("nodata", "band"))
-        region = Window(*window) if window else None
-        return command(pair=PairArguments((left, right), masks, nodata, band, region), **others)
-
-    return with_options(
-        with_pair,
-        click.argument("left", type=NAME),
-        click.argument("right", type=NAME),
-        *_IMAGE_OPTIONS,
-        click.option(
-            "--window", type=int, nargs=4, metavar="ROW COL HEIGHT WIDTH", help="Region of the left image to match."
-        ),
-    )
-
-
-_SEARCH_OPTIONS = (
     click.option(
-        "--disparity",
-        type=int,
-        nargs=2,
-        metavar="MIN MAX",
-        help="Search range in pixels, both ends searched; default: found from the images.",
-    ),
-    click.option(
-        "--local-range", is_flag=True, help="Search a separate range in each cell of the image, found from the images."
+        "--window", type=int, nargs=4, metavar="ROW COL HEIGHT WIDTH", help="Region of the left image to match."
     ),
 )
+
+
 _LEVEL_OPTIONS = (
     click.option("--coverage", type=float, metavar="C", help="Share of true disparities to be inside, .5 to .99."),
     click.option("--calibration", type=NAME, help="Calibration for --coverage; default the built-in one."),
@@ -167,7 +158,12 @@ _LEVEL_OPTIONS = (
 )
 _FIRST_SETTINGS = (
     click.option("--config", "config_file", type=FILE, help="Settings (YAML); the command line wins."),
-    preset_option,
+    click.option(
+        "--preset",
+        type=click.Choice(PRESETS),
+        help="satellite (default), satellite-mccnn for different dates or little texture, paper for the paper's "
+        "figures.",
+    ),
 )
 _LAST_SETTINGS = (
     click.option("--tile-size", type=int, help="Side of a tile's core in pixels, a multiple of 64."),
@@ -181,7 +177,6 @@ _LAST_SETTINGS = (
         "--set", "named", multiple=True, metavar="KEY=VALUE", help="Any other setting, such as tiles.overlap=100."
     ),
 )
-
 
 # Section and key of the options that are settings as they stand.
 _PLACES = {
@@ -209,14 +204,19 @@ def settings_options(command: Command, *, levels: bool = True) -> Command:
         sections = _named(named) | ({"preset": preset} if preset else {})
         for name, (section, key) in places.items():
             if values[name] is not None:
-                sections[section] = sections.get(section, {}) | {key: values[name]}
+                sections = _with(sections, section, {key: values[name]})
         if cluster:
             chosen = {"kind": "address", "address": cluster} if "://" in cluster else {"kind": cluster}
-            sections["cluster"] = sections.get("cluster", {}) | chosen
+            sections = _with(sections, "cluster", chosen)
         options = tuple(f"--{name.replace('_', '-')}" for name, value in given.items() if value is not None)
         return command(settings=SettingsArguments(config_file, sections, options), **others)
 
     return with_options(with_settings, *_FIRST_SETTINGS, *(_LEVEL_OPTIONS if levels else ()), *_LAST_SETTINGS)
+
+
+def _with(sections: dict[str, Any], section: str, values: dict[str, Any]) -> dict[str, Any]:
+    """Return sections of settings with values in one of them."""
+    return sections | {section: (sections.get(section) or {}) | values}
 
 
 def _named(settings: tuple[str, ...]) -> dict[str, Any]:
@@ -239,32 +239,41 @@ def _named(settings: tuple[str, ...]) -> dict[str, Any]:
     return sections
 
 
+def _with_search(
+    *, settings: SettingsArguments, disparity: tuple[int, int] | None, local_range: bool
+) -> SettingsArguments:
+    sections = settings.sections
+    if disparity:
+        sections = _with(sections, "disparity", {"minimum": disparity[0], "maximum": disparity[1]})
+    if local_range:
+        sections = _with(sections, "disparity", {"local": True})
+    return replace(settings, sections=sections)
+
+
 def search_options(command: Command) -> Command:
     """Add options for the search range and for settings; the command gets ``settings``, which has both."""
-
-    @wraps(command)
-    def with_search(
-        *, settings: SettingsArguments, disparity: tuple[int, int] | None, local_range: bool, **others: Any
-    ) -> Any:
-        search: dict[str, Any] = dict(zip(("minimum", "maximum"), disparity or (), strict=False))
-        if local_range:
-            search["local"] = True
-        named = settings.sections.get("disparity", {})
-        sections = settings.sections | ({"disparity": named | search} if search else {})
-        return command(settings=replace(settings, sections=sections), **others)
-
-    return with_options(settings_options(with_search), *_SEARCH_OPTIONS)
+    return with_options(
+        settings_options(gathered("settings", _with_search)(command)),
+        click.option(
+            "--disparity",
+            type=int,
+            nargs=2,
+            metavar="MIN MAX",
+            help="Search range in pixels, both ends searched; default: found from the images.",
+        ),
+        click.option(
+            "--local-range",
+            is_flag=True,
+            help="Search a separate range in each cell of the image, found from the images.",
+        ),
+    )
 
 
 def run_options(command: Command) -> Command:
     """Add options of commands that match pairs; the command gets ``run``, a `RunArguments`."""
-
-    @wraps(command)
-    def with_run(*, keep_tiles: bool, overwrite: bool, strict: bool, quiet: bool, **others: Any) -> Any:
-        return command(run=RunArguments(keep_tiles, overwrite, strict, quiet), **others)
-
-    return with_options(
-        with_run,
+    with_run = gathered(
+        "run",
+        RunArguments,
         click.option("--strict", is_flag=True, help="End with status 1 if the run prints a warning."),
         click.option("--keep-tiles", is_flag=True, help="Keep the products of tiles, until a call without it."),
         click.option(
@@ -273,5 +282,5 @@ def run_options(command: Command) -> Command:
             help="May replace another run in OUT; its tiles are deleted, equal ones are used again.",
         ),
         quiet_option,
-        log_options,
     )
+    return with_run(log_options(command))

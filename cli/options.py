@@ -1,9 +1,12 @@
 """Options shared by commands, and checks of file names."""
 
+import json
+import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import wraps
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +22,19 @@ PRESETS = ("satellite", "satellite-mccnn", "paper", "mccnn")
 PICTURES = ("overview", "errors", "coverage", "range", "profile", "curve", "dsm")
 
 Command = Callable[..., Any]
+Decorator = Callable[[Command], Command]
 
 # What rasterio takes for an address, even if there is a folder with this name.
 _ADDRESS = re.compile(r"(file|https?|ftp|s3|gs|az|oss|zip|tar|gzip)(\+\w+)*:", re.IGNORECASE)
 
 
 class _Name(click.ParamType):  # type: ignore[type-arg,unused-ignore]
-    """A name that GDAL can open: UTF-8, and not empty, as from an unset shell variable."""
+    """A name that GDAL can open: UTF-8, and not empty, as from an unset shell variable; or a path of this machine."""
 
     name = "file"
+
+    def __init__(self, *, is_path: bool) -> None:
+        self._is_path = is_path
 
     def convert(self, value: Any, parameter: click.Parameter | None, context: click.Context | None) -> Any:
         if value == "":
@@ -36,7 +43,9 @@ class _Name(click.ParamType):  # type: ignore[type-arg,unused-ignore]
             str(value).encode()
         except UnicodeEncodeError:
             self.fail(f"{value!r} is not UTF-8: rename it", parameter, context)
-        return value
+        if self._is_path and _ADDRESS.match(str(value)):
+            self.fail(f"{value} is read as an address: give the path of a file or folder here", parameter, context)
+        return Path(value) if self._is_path else value
 
     def shell_complete(
         self, context: click.Context, parameter: click.Parameter, incomplete: str
@@ -44,42 +53,53 @@ class _Name(click.ParamType):  # type: ignore[type-arg,unused-ignore]
         return [CompletionItem(incomplete, type="file")]
 
 
-class _File(_Name):
-    """The path of a file or folder."""
-
-    def convert(self, value: Any, parameter: click.Parameter | None, context: click.Context | None) -> Any:
-        if _ADDRESS.match(str(name := super().convert(value, parameter, context))):
-            self.fail(f"{name} is read as an address: give the path of a file or folder here", parameter, context)
-        return Path(name)
+NAME, FILE = _Name(is_path=False), _Name(is_path=True)
 
 
-NAME, FILE = _Name(), _File()
+def gathered(name: str, gather: Callable[..., Any], *options: Decorator) -> Decorator:
+    """Return a decorator that adds options; the command gets ``name``, what ``gather`` makes of their values."""
+    parameters = signature(gather).parameters
+
+    def decorated(command: Command) -> Command:
+        @wraps(command)
+        def with_gathered(**given: Any) -> Any:
+            values = {parameter: given.pop(parameter) for parameter in parameters}
+            return command(**{name: gather(**values)}, **given)
+
+        return with_options(with_gathered, *options)
+
+    return decorated
+
+
+def with_options(command: Command, *options: Decorator) -> Command:
+    """Add options to a command, in the order of its help."""
+    for option in reversed(options):
+        command = option(command)
+    return command
+
 
 quiet_option = click.option("--quiet", "-q", is_flag=True, help="Print errors only.")
-preset_option = click.option(
-    "--preset",
-    type=click.Choice(PRESETS),
-    help="satellite (default), satellite-mccnn for different dates or little texture, paper for the paper's figures.",
-)
-_SENSOR_OPTIONS = tuple(
-    click.option(f"--{side}-{kind}", required=True, type=FILE, help=text.format(side))
-    for kind, text in (("model", "RPC model of the {} sensor image."), ("grid", "Epipolar grid of the {} image."))
-    for side in ("left", "right")
+overwrite_option = click.option("--overwrite", is_flag=True, help="Replace files that exist.")
+json_option = click.option("--json", "as_json", is_flag=True, help="Print all figures as JSON.")
+truth_option = click.option(
+    "--truth", type=FILE, help="True disparity; default truth.tif beside the left image, if it exists."
 )
 
 
-def sensor_options(command: Command) -> Command:
-    """Add options for models and grids; the command gets ``sensor_files``, in this order."""
-
-    @wraps(command)
-    def with_sensors(*, left_model: Path, right_model: Path, left_grid: Path, right_grid: Path, **others: Any) -> Any:
-        return command(sensor_files=(left_model, right_model, left_grid, right_grid), **others)
-
-    return with_options(with_sensors, *_SENSOR_OPTIONS)
+# The command gets ``sensor_files``, in the order of the library.
+sensor_options = gathered(
+    "sensor_files",
+    lambda left_model, right_model, left_grid, right_grid: (left_model, right_model, left_grid, right_grid),
+    *(
+        click.option(f"--{side}-{kind}", required=True, type=FILE, help=text.format(side))
+        for kind, text in (("model", "RPC model of the {} sensor image."), ("grid", "Epipolar grid of the {} image."))
+        for side in ("left", "right")
+    ),
+)
 
 
 @dataclass(frozen=True)
-class SurfaceAndReference:
+class Surface:
     """A surface model, reference heights to compare it with, and whether these are moved to it first."""
 
     dsm: Path
@@ -87,44 +107,51 @@ class SurfaceAndReference:
     registers: bool
 
 
-def reference_options(dsm_help: str) -> Callable[[Command], Command]:
-    """Return a decorator that adds --dsm, --reference and --no-register.
+# Options of commands for surface models and others that apply to both.
+_FOR_BOTH = {"output", "overwrite", "name", "as_json", "quiet", "debug", "log_file"}
 
-    The command gets ``surface``, a `SurfaceAndReference`, or None without them.
+
+def surface_options(dsm_help: str, others: str, *of_surfaces: str) -> Decorator:
+    """Return a decorator that adds --dsm, --reference and --no-register to a command for ``others``, such as pairs.
+
+    The command gets ``surface``, a `Surface` or None. ``of_surfaces`` are its further options that need --dsm.
     """
 
-    def decorated(command: Command) -> Command:
-        @wraps(command)
-        def with_reference(*, dsm: Path | None, reference: Path | None, no_register: bool, **others: Any) -> Any:
-            if bool(dsm) != bool(reference):
-                raise click.UsageError("--dsm and --reference go together: give both.")
-            if no_register and not dsm:
-                raise click.UsageError("--no-register goes with --dsm: leave it out.")
-            surface = SurfaceAndReference(dsm, reference, not no_register) if dsm and reference else None
-            return command(surface=surface, **others)
+    def gather(*, dsm: Path | None, reference: Path | None, no_register: bool) -> Surface | None:
+        if bool(dsm) != bool(reference):
+            raise click.UsageError("--dsm and --reference go together: give both.")
+        if no_register and not dsm:
+            raise click.UsageError("--no-register goes with --dsm: leave it out.")
+        _check_options(bool(dsm), others, of_surfaces)
+        return Surface(dsm, reference, not no_register) if dsm and reference else None
 
-        return with_options(
-            with_reference,
-            click.option("--dsm", type=FILE, help=dsm_help),
-            click.option(
-                "--reference",
-                type=FILE,
-                help="With --dsm: reference heights above the same datum, in any CRS.",
-            ),
-            click.option("--no-register", is_flag=True, help="With --dsm: do not move the reference to the surface."),
-        )
-
-    return decorated
+    return gathered(
+        "surface",
+        gather,
+        click.option("--dsm", type=FILE, help=dsm_help),
+        click.option("--reference", type=FILE, help="With --dsm: reference heights above the same datum, in any CRS."),
+        click.option("--no-register", is_flag=True, help="With --dsm: do not move the reference to the surface."),
+    )
 
 
-overwrite_option = click.option("--overwrite", is_flag=True, help="Replace files that exist.")
-json_option = click.option("--json", "as_json", is_flag=True, help="Print all figures as JSON.")
+def _check_options(has_surface: bool, others: str, of_surfaces: Sequence[str]) -> None:
+    """Raise for what the command line has beside a surface model, or without one, and must not."""
+    context = click.get_current_context()
+    for parameter in context.command.params:
+        key, option = parameter.name or "", parameter.opts[0]
+        if not context.params[key] or key in ("dsm", "reference", "no_register"):
+            continue
+        if not has_surface and key in of_surfaces:
+            raise click.UsageError(f"{option} applies only with --dsm: leave it out.")
+        if has_surface and isinstance(parameter, click.Argument):
+            line = f"{context.params[key][0]} is given, and --dsm: {context.info_name} one of them at a time."
+            raise click.UsageError(line)
+        if has_surface and key not in of_surfaces and key not in _FOR_BOTH:
+            raise click.UsageError(f"{option} applies to {others}, not to --dsm: leave it out.")
 
 
 def say_json(content: Any) -> None:
     """Print figures as JSON; NaN and infinity are null."""
-    import json
-    import math
 
     def plain(value: Any) -> Any:
         if isinstance(value, dict):
@@ -149,10 +176,3 @@ def log_options(command: Command) -> Command:
         click.option("--debug", is_flag=True, help="Show the complete log, and tracebacks of errors."),
         click.option("--log-file", type=FILE, help="Append the complete log to FILE."),
     )
-
-
-def with_options(command: Command, *options: Callable[[Command], Command]) -> Command:
-    """Add options to a command, in the order of its help."""
-    for option in reversed(options):
-        command = option(command)
-    return command

@@ -6,13 +6,13 @@ from typing import Any
 
 import click
 
-from sat_intervals.cli.judging import finite
-from sat_intervals.cli.options import FILE, PICTURES, log_options
+from sat_intervals.cli.judging import TOLERANCE
+from sat_intervals.cli.options import FILE, PICTURES, log_options, truth_option
 
 
 @click.command(short_help="Draw a finished run: maps, profile of a row, errors, cost curve of a pixel.")
 @click.argument("out", type=FILE)
-@click.option("--truth", type=FILE, help="True disparity; default truth.tif beside the left image, if it exists.")
+@truth_option
 @click.option("--row", type=int, metavar="R", help="Draw the profile of this row.")
 @click.option("--columns", type=int, nargs=2, metavar="A B", help="First and last column of the profile.")
 @click.option("--pixel", type=int, nargs=2, metavar="R C", help="Draw the cost curve of this pixel.")
@@ -20,10 +20,7 @@ from sat_intervals.cli.options import FILE, PICTURES, log_options
     "--beside", type=FILE, multiple=True, metavar="OUT", help="Run of the same pair at another coverage, to draw too."
 )
 @click.option("--mask", type=FILE, help="Pixels that coverage.png counts (not 0).")
-@click.option(
-    "--tolerance", type=click.FloatRange(min=0), default=0.0, callback=finite, metavar="PX",
-    help="In coverage.png, truth up to PX outside an interval counts as inside.",
-)  # fmt: skip
+@click.option("--tolerance", **TOLERANCE, help="In coverage.png, truth up to PX outside an interval counts as inside.")
 @click.option("--remove-bias", is_flag=True, help="In coverage.png, add the median of disparity - truth to the truth.")
 @click.option("--dpi", type=click.IntRange(30, 600), default=110, show_default=True, help="Dots per inch.")
 @log_options

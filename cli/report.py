@@ -4,12 +4,12 @@ from pathlib import Path
 
 import click
 
-from sat_intervals.cli.options import FILE, log_options
+from sat_intervals.cli.options import FILE, log_options, truth_option
 
 
 @click.command(short_help="Write an HTML page of a finished run.")
 @click.argument("out", type=FILE)
-@click.option("--truth", type=FILE, help="True disparity; default truth.tif beside the left image, if it exists.")
+@truth_option
 @log_options
 def report(out: Path, truth: Path | None) -> None:
     """Write OUT/report.html, one self-contained file for any browser.
