@@ -1,7 +1,7 @@
 """What the commands share that compare with a known truth: pairs and runs, options, reports."""
 
-from collections.abc import Sequence
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
