@@ -1,5 +1,6 @@
 """``sat-intervals ablate``: compare parts of the method on pairs with known truth."""
 
+from functools import partial
 from pathlib import Path
 
 import click
@@ -10,7 +11,7 @@ from sat_intervals.cli.options import FILE
 
 @click.command(short_help="Compare parts of the method on pairs with known truth.")
 @click.argument("pairs", nargs=-1, required=True, type=FILE)
-@judging_options
+@partial(judging_options, levels=False)
 def ablate(pairs: tuple[Path, ...], judging: Judging) -> None:
     """Compare the paper's baseline, alpha-cuts at several levels, and the whole method on PAIRS.
 

@@ -48,11 +48,14 @@ class Judging:
         return config
 
 
-def judging_options(command: Command) -> Command:
-    """Add the options of commands that evaluate pairs with known truth; the command gets ``judging``, a `Judging`."""
+def judging_options(command: Command, *, levels: bool = True) -> Command:
+    """Add the options of commands that evaluate pairs with known truth; the command gets ``judging``, a `Judging`.
+
+    ``levels`` is that of `settings_options`.
+    """
     quiet_option = click.option("--quiet", "-q", is_flag=True, help="Print figures and errors only.")
     with_judging = gathered("judging", Judging, tolerance_option, json_option, quiet_option)
-    return settings_options(with_judging(log_options(command)))
+    return settings_options(with_judging(log_options(command)), levels=levels)
 
 
 @dataclass(frozen=True)

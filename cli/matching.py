@@ -1,7 +1,7 @@
 """Options shared by the commands that match: the pair, its settings, the run."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -178,13 +178,13 @@ _LAST_SETTINGS = (
     ),
 )
 
-# Section and key of the options that are settings as they stand.
+# Dotted names of the options that are settings as they stand.
 _PLACES = {
-    "coverage": ("interval", "coverage"),
-    "calibration": ("interval", "calibration"),
-    "alpha": ("interval", "alpha"),
-    "tile_size": ("tiles", "size"),
-    "workers": ("cluster", "workers"),
+    "coverage": "interval.coverage",
+    "calibration": "interval.calibration",
+    "alpha": "interval.alpha",
+    "tile_size": "tiles.size",
+    "workers": "cluster.workers",
 }
 
 
@@ -198,25 +198,33 @@ def settings_options(command: Command, *, levels: bool = True) -> Command:
     def with_settings(
         *, config_file: Path | None, preset: str | None, cluster: str | None, named: tuple[str, ...], **others: Any
     ) -> Any:
-        places = {name: place for name, place in _PLACES.items() if levels or place[0] != "interval"}
+        places = {name: key for name, key in _PLACES.items() if levels or not key.startswith("interval.")}
         values = {name: others.pop(name) for name in places}
         given = {"config": config_file, "preset": preset, "cluster": cluster, "set": named or None} | values
-        sections = _named(named) | ({"preset": preset} if preset else {})
-        for name, (section, key) in places.items():
-            if values[name] is not None:
-                sections = _with(sections, section, {key: values[name]})
+        sections = _named(named)
+        _put(sections, "--preset", preset=preset)
+        for name, key in places.items():
+            _put(sections, f"--{name.replace('_', '-')}", **{key: values[name]})
         if cluster:
-            chosen = {"kind": "address", "address": cluster} if "://" in cluster else {"kind": cluster}
-            sections = _with(sections, "cluster", chosen)
+            is_address = "://" in cluster
+            chosen = {"kind": "address", "address": cluster} if is_address else {"kind": cluster}
+            _put(sections, "--cluster", **{f"cluster.{key}": value for key, value in chosen.items()})
         options = tuple(f"--{name.replace('_', '-')}" for name, value in given.items() if value is not None)
         return command(settings=SettingsArguments(config_file, sections, options), **others)
 
     return with_options(with_settings, *_FIRST_SETTINGS, *(_LEVEL_OPTIONS if levels else ()), *_LAST_SETTINGS)
 
 
-def _with(sections: dict[str, Any], section: str, values: dict[str, Any]) -> dict[str, Any]:
-    """Return sections of settings with values in one of them."""
-    return sections | {section: (sections.get(section) or {}) | values}
+def _put(sections: dict[str, Any], option: str, **settings: Any) -> None:
+    """Put what an option sets, by dotted names, into sections of settings; None is not given."""
+    from sat_intervals.config.files import set_by_name
+
+    for key, value in settings.items():
+        if value is not None:
+            try:
+                set_by_name(sections, key, value)
+            except ValueError as error:
+                raise click.UsageError(f"{option} and --set {key}: {error}") from error
 
 
 def _named(settings: tuple[str, ...]) -> dict[str, Any]:
@@ -225,7 +233,7 @@ def _named(settings: tuple[str, ...]) -> dict[str, Any]:
         return {}
     import yaml
 
-    from sat_intervals.config.files import set_by_name
+    from sat_intervals.config.files import load_yaml, set_by_name
 
     sections: dict[str, Any] = {}
     for setting in settings:
@@ -233,7 +241,7 @@ def _named(settings: tuple[str, ...]) -> dict[str, Any]:
         try:
             if not equals:
                 raise ValueError("give KEY=VALUE, such as tiles.overlap=100")
-            set_by_name(sections, key, value)
+            set_by_name(sections, key, load_yaml(value))
         except (ValueError, yaml.YAMLError) as error:
             raise click.UsageError(f"--set {setting}: {' '.join(str(error).split())}") from error
     return sections
@@ -242,12 +250,11 @@ def _named(settings: tuple[str, ...]) -> dict[str, Any]:
 def _with_search(
     *, settings: SettingsArguments, disparity: tuple[int, int] | None, local_range: bool
 ) -> SettingsArguments:
-    sections = settings.sections
     if disparity:
-        sections = _with(sections, "disparity", {"minimum": disparity[0], "maximum": disparity[1]})
-    if local_range:
-        sections = _with(sections, "disparity", {"local": True})
-    return replace(settings, sections=sections)
+        ends = {"disparity.minimum": disparity[0], "disparity.maximum": disparity[1]}
+        _put(settings.sections, "--disparity", **ends)
+    _put(settings.sections, "--local-range", **{"disparity.local": local_range or None})
+    return settings
 
 
 def search_options(command: Command) -> Command:

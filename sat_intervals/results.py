@@ -170,7 +170,7 @@ def open_run(out: str | Path) -> Run:
     except OSError as error:
         raise SatIntervalsError(f"{file}: {error.strerror}: give the folder of a finished run") from error
     except SatIntervalsError as error:
-        raise SatIntervalsError(f"{file}: {error}") from error
+        raise SatIntervalsError(f"{file}: {error}: made by another version, match again with --overwrite") from error
     except ValueError as error:
         where = ", see " + ".".join(map(str, error.errors()[0]["loc"])) if isinstance(error, ValidationError) else ""
         raise SatIntervalsError(f"{file} is not the report of a run{where}: match again with --overwrite") from error

@@ -58,7 +58,7 @@ def load_yaml(text: str | bytes, most: int = _NODES) -> Any:
 
 
 def set_by_name(settings: dict[str, Any], key: str, value: Any) -> None:
-    """Set a setting by its dotted name, such as ``tiles.size``; text is parsed as YAML."""
+    """Set a setting by its dotted name, such as ``tiles.size``."""
     *sections, last = key.split(".")
     for section in sections:
         settings = settings.setdefault(section, {})
@@ -66,7 +66,7 @@ def set_by_name(settings: dict[str, Any], key: str, value: Any) -> None:
             raise ValueError(f"{section} is also given as a whole")
     if last in settings:
         raise ValueError(f"parts of {last} are also given" if isinstance(settings[last], dict) else "given twice")
-    settings[last] = load_yaml(value) if isinstance(value, str) else value
+    settings[last] = value
 
 
 def read_small(file: Path, most: int = _LARGEST_FILE) -> bytes:

@@ -205,7 +205,8 @@ def _of_batch(place: str, row: dict[str, Any], file: Path) -> PairOfBatch:
     settings: dict[str, Any] = {}
     for key, value in row.items():
         try:
-            set_by_name(settings, f"disparity.{key}" if key in ("minimum", "maximum") else str(key), value)
+            name_of_setting = f"disparity.{key}" if key in ("minimum", "maximum") else str(key)
+            set_by_name(settings, name_of_setting, load_yaml(value) if isinstance(value, str) else value)
         except (ValueError, RecursionError, yaml.YAMLError) as error:
             raise SatIntervalsError(f"{place}: {key} is {value!r}: {_why(error)}") from error
     return PairOfBatch(name, settings=settings, reading=reading, window=window, **images, **surface)

@@ -7,6 +7,8 @@ from typing import Any
 
 import yaml
 
+from sat_intervals.config.sections import Section
+
 # The first is the default: its settings are the defaults of all sections.
 PRESETS = ("satellite", "satellite-mccnn", "paper", "mccnn")
 
@@ -29,6 +31,7 @@ def merged(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str,
     What belongs to another matching cost, other penalties or another level of intervals than theirs is left out.
     """
     kept = {name: dict(section) if isinstance(section, Mapping) else section for name, section in values.items()}
+    overrides = {name: _given_keys(name, section) for name, section in overrides.items()}
 
     def given(settings: Mapping[str, Any], section: str) -> Mapping[str, Any]:
         found = settings.get(section)
@@ -53,3 +56,11 @@ def merged(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str,
         below = kept.get(name)
         kept[name] = below | dict(section) if isinstance(below, dict) and isinstance(section, Mapping) else section
     return kept
+
+
+def _given_keys(name: str, section: Any) -> Any:
+    """Return the keys that a section was made with, and its kind; other values as they are."""
+    if not isinstance(section, Section):
+        return section
+    kind = {"cost": "method", "sgm": "penalty"}.get(name)
+    return section.model_dump(exclude_unset=True) | ({kind: getattr(section, kind)} if kind else {})

@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from sat_intervals.config.files import read_mapping
 from sat_intervals.config.presets import PRESETS, merged, preset_settings
-from sat_intervals.config.sections import ConfigError, Section
+from sat_intervals.config.sections import ConfigError
 from sat_intervals.config.settings import Config
 from sat_intervals.config.wording import explained, shown
 
@@ -44,7 +44,7 @@ def load_config(
     """
     if isinstance(source, Config) and not overrides:
         return source
-    overrides = _plain(overrides or {})
+    overrides = overrides or {}
     place = f"{source}: " if isinstance(source, str | Path) else f"{file}: " if file else ""
     values = _values(source)
     names = [settings["preset"] for settings in (values, overrides) if settings.get("preset") is not None]
@@ -56,8 +56,8 @@ def load_config(
     if len(set(map(str, names))) > 1 and not preset_wins:
         raise ConfigError(f"{place}preset is {shown(names[0])}, and {shown(names[1])} is asked for: leave one out")
     preset = names[-1] if names else PRESETS[0]
-    if preset in PRESETS:
-        values = merged(preset_settings(preset), values)
+    # Before the overrides: those of another cost drop what the source has for the cost of its preset.
+    values = merged(preset_settings(preset) if preset in PRESETS else {}, values)
     try:
         return Config.model_validate(merged(values, overrides))
     except ValidationError as error:
@@ -77,12 +77,8 @@ def _values(source: Any) -> Mapping[str, Any]:
         case Config():
             return source.model_dump()
         case Mapping():
-            return _plain(source)
+            return source
     raise ConfigError(f"settings are {shown(source)}, allowed: a YAML file, a mapping or a Config")
-
-
-def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value.model_dump() if isinstance(value, Section) else value for name, value in settings.items()}
 
 
 def named_files(settings: Mapping[str, Any] | Config | None) -> list[str]:

@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 from sat_intervals.config.calibration import Calibration, Levels, at, built_in
 from sat_intervals.config.interval import Interval
 from sat_intervals.config.penalties import AnySgm, MccnnSgm, Sgm
-from sat_intervals.config.presets import PRESETS
+from sat_intervals.config.presets import PRESETS, merged, preset_settings
 from sat_intervals.config.sections import (
     Ambiguity,
     Census,
@@ -55,16 +55,16 @@ class Config(Section):
     @model_validator(mode="before")
     @classmethod
     def _choose_methods(cls, values: Any) -> Any:
-        """Add the missing kinds of sections: census, and the penalties of the cost."""
+        """Add what the preset has for missing keys, and the penalties of the cost."""
         if not isinstance(values, Mapping):
             return values
-        cost, sgm = values.get("cost", {}), values.get("sgm", {})
-        if isinstance(cost, Mapping):
-            cost = {"method": "census", **cost}
-        method = cost["method"] if isinstance(cost, Mapping) else getattr(cost, "method", None)
+        preset = values.get("preset", PRESETS[0])
+        values = merged(preset_settings(preset) if preset in PRESETS else {}, values)
+        cost, sgm = values.get("cost"), values.get("sgm", {})
         if isinstance(sgm, Mapping):
-            sgm = {"penalty": "mc_cnn_fast" if method == "mccnn" else "constant", **sgm}
-        return {**values, "cost": cost, "sgm": sgm}
+            is_mccnn = isinstance(cost, Mapping) and cost.get("method") == "mccnn"
+            values["sgm"] = {"penalty": "mc_cnn_fast" if is_mccnn else "constant", **sgm}
+        return values
 
     @model_validator(mode="after")
     def _check_sections(self) -> Self:

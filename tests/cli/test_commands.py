@@ -159,6 +159,14 @@ def test_match__refuses_images_that_are_no_pair(folder, tmp_path, arguments, say
         (["--tile-size", 100], ["tiles.size is 100, allowed: integer >= 64, ", "multiple of 64"]),
         (["--set", "tiles.overlap=2"], ["tiles.overlap is 2, allowed: >= 4 with cost.window 7"]),
         (["--set", "tiles.overlap"], ["--set tiles.overlap: give KEY=VALUE"]),
+        (
+            ["--disparity", -9, 4, "--set", "disparity=5"],
+            ["--disparity and --set disparity.minimum: disparity is also given as a whole"],
+        ),
+        (
+            ["--disparity", -9, 4, "--set", "disparity.maximum=9"],
+            ["--disparity and --set disparity.maximum: given twice"],
+        ),
         (["--workers", 0], ["'--workers': 0 is not in the range x>=1"]),
         (["--workers", -2], ["'--workers': -2 is not in the range x>=1"]),
         (["--nodata", "none"], ["'--nodata': 'none' is neither a number nor two, LEFT,RIGHT"]),

@@ -164,6 +164,12 @@ def test_load_config__penalties_beside_a_preset_stay_with_its_cost_and_go_with_a
     assert load_config(file, {"cost": {"method": "census"}} | more).sgm == Sgm()
 
 
+def test_config__takes_the_preset_for_what_is_left_out() -> None:
+    assert Config(preset="paper") == load_config({"preset": "paper"})
+    changed = Config(preset="paper", sgm=Sgm(p1=9))
+    assert changed.sgm == load_config({"preset": "paper", "sgm": Sgm(p1=9)}).sgm == Sgm(p1=9, p2=32)
+
+
 def test_load_config__two_presets_are_refused(write) -> None:
     file = write("preset: paper\n")
     expected = f"{file}: preset is 'paper', and 'mccnn' is asked for: leave one out"

@@ -197,6 +197,11 @@ def test_match_batch__holds_the_folders_of_its_pairs(images, tmp_path):
     assert "another run is active" in report["pair1"]["error"]
 
 
+def test_match_batch__refuses_a_folder_where_another_batch_is_active(images, tmp_path):
+    with locked(tmp_path), pytest.raises(SatIntervalsError, match="another run is active"):
+        match_batch(read_batch(rows(images)), tmp_path)
+
+
 def test_match_batch__keeps_the_tiles_of_equal_pairs_apart(images, tmp_path):
     pair = PairOfBatch("first", str(images / "left1.tif"), str(images / "right1.tif"))
     config = {"disparity": {"minimum": -18, "maximum": 40}, "cluster": {"store": str(tmp_path / "store")}}
