@@ -20,7 +20,7 @@ demo: $(VENV)/.has-plot
 	$(BIN)/sat-intervals plot demo-out & $(BIN)/sat-intervals report demo-out && wait $$!
 	@echo 'Open demo-out/overview.png and demo-out/report.html'
 
-# Tests that need no services, no other extras and no real pairs; two to four minutes on two cores.
+# Tests that need no services, no other extras and no real pairs; at most three minutes on two cores.
 test: $(READY)
 	$(PYTEST) $(PARALLEL) -m 'not process and not peer and not ported'
 
