@@ -93,7 +93,8 @@ def _configs(sources: list[Source], judging: Judging) -> "list[Config | None]":
         judging.load(source.pair, products={"keep_rejected": True}) if source.pair else None for source in sources
     ]
     if any(config and config.interval is None for config in configs):
-        raise SatIntervalsError("interval is null, but evaluate needs intervals: leave it on")
+        place = f"{judging.settings.file}: " if judging.settings.file else ""
+        raise SatIntervalsError(f"{place}interval is null, but evaluate needs intervals: leave it on")
     return configs
 
 
