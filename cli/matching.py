@@ -154,7 +154,7 @@ pair_options = gathered(
 _LEVEL_OPTIONS = (
     click.option("--coverage", type=float, metavar="C", help="Share of true disparities to be inside, .5 to .99."),
     click.option("--calibration", type=NAME, help="Calibration for --coverage; default the built-in one."),
-    click.option("--alpha", type=float, metavar="A", help="Level of possibility, 0 to 1, instead of a coverage."),
+    click.option("--alpha", type=float, metavar="A", help="Level of possibility, above 0 to 1, instead of a coverage."),
 )
 _FIRST_SETTINGS = (
     click.option("--config", "config_file", type=FILE, help="Settings (YAML); the command line wins."),
