@@ -6,7 +6,7 @@ import click
 
 from sat_intervals.cli.matching import RunArguments, SettingsArguments, run_options, settings_options
 from sat_intervals.cli.options import FILE, json_option, say_json
-from sat_intervals.cli.triangulate import point_warnings
+from sat_intervals.cli.triangulate import geometry_warnings
 
 
 @click.command(short_help="Match many pairs; a rerun matches the missing ones.")
@@ -45,8 +45,10 @@ def batch(pairs: Path, out: Path, as_json: bool, settings: SettingsArguments, ru
     if as_json:
         say_json(report)
     console.batch_summary(report)
-    of_points = [f"{name}: {line}" for name, end in report.items() for line in point_warnings(end.get("points", {}))]
-    for line in of_points:
+    of_surfaces = [
+        line for end in report.values() if "surface" in end for line in geometry_warnings(end["surface"]["geometry"])
+    ]
+    for line in of_surfaces:
         click.echo(line, err=True)
     done = ("done", "done before")
     failed = {name: end.get("error", end["state"]) for name, end in report.items() if end["state"] not in done}
@@ -58,4 +60,4 @@ def batch(pairs: Path, out: Path, as_json: bool, settings: SettingsArguments, ru
             f"{len(failed)} of {len(report)} pairs failed; fix the causes and rerun the same command: it matches only "
             f"the missing pairs:\n{lines}"
         )
-    run.check_strict([*(line for end in report.values() for line in end.get("warnings", ())), *of_points])
+    run.check_strict([*(line for end in report.values() for line in end.get("warnings", ())), *of_surfaces])

@@ -24,7 +24,7 @@ STAGES = {
     "tiles": "matching tiles",
     "bands": "postprocessing rows",
     "points": "triangulating rows",
-    "extent": "reading points",
+    "geometry": "reading models and grids",
     "cells": "filling rows of cells",
     "registration": "registering the reference",
     "reference": "reading points",

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import wraps
 from inspect import signature
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -86,16 +87,41 @@ truth_option = click.option(
 )
 
 
-# The command gets ``sensor_files``, in the order of the library.
-sensor_options = gathered(
-    "sensor_files",
-    lambda left_model, right_model, left_grid, right_grid: (left_model, right_model, left_grid, right_grid),
-    *(
-        click.option(f"--{side}-{kind}", required=True, type=FILE, help=text.format(side))
-        for kind, text in (("model", "RPC model of the {} sensor image."), ("grid", "Epipolar grid of the {} image."))
+def _sensor_options(gather: Callable[..., Any], times: str, **kind_of_option: Any) -> Decorator:
+    texts = (("model", "RPC model of the {} sensor image"), ("grid", "Epipolar grid of the {} image"))
+    options = (
+        click.option(f"--{side}-{kind}", type=FILE, help=f"{text.format(side)}{times}.", **kind_of_option)
+        for kind, text in texts
         for side in ("left", "right")
-    ),
-)
+    )
+    return gathered("sensor_files", gather, *options)
+
+
+def _one_set(
+    left_model: Path | None, right_model: Path | None, left_grid: Path | None, right_grid: Path | None
+) -> tuple[Path, Path, Path, Path] | None:
+    files = left_model, right_model, left_grid, right_grid
+    if not any(files):
+        return None
+    if not all(files):
+        raise click.UsageError("--left-model, --right-model, --left-grid and --right-grid go together: give all four.")
+    return files  # type: ignore[return-value]
+
+
+def _sets(
+    left_model: tuple[Path, ...],
+    right_model: tuple[Path, ...],
+    left_grid: tuple[Path, ...],
+    right_grid: tuple[Path, ...],
+) -> list[tuple[Path, Path, Path, Path]]:
+    sets = [_one_set(*files) for files in zip_longest(left_model, right_model, left_grid, right_grid)]
+    return [files for files in sets if files]
+
+
+# The command gets ``sensor_files``, in the order of the library, or None: those that the run's folder remembers.
+sensor_options = _sensor_options(_one_set, "")
+# The command gets a list of them, for several runs.
+sensor_options_of_runs = _sensor_options(_sets, ", once per OUT", multiple=True)
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ _SUSPECT_HEIGHT, _SUSPECT_ROWS = 10.0, 0.5
 @click.option("--ellipsoid", is_flag=True, help="Heights are above the ellipsoid of WGS 84.")
 @click.option("--geoid", type=FILE, help="Geoid grid (GTX, GeoTIFF) that heights refer to.")
 @click.option("--crs", metavar="EPSG", help="CRS of the heights, in place of the file's.")
-@click.option("--no-register", is_flag=True, help="Do not move the reference to the points of the run.")
+@click.option("--no-register", is_flag=True, help="Do not move the reference to the heights of the run.")
 @click.option("--output", type=FILE, help="File to write; default truth.tif in OUT.")
 @overwrite_option
 @sensor_options
@@ -46,7 +46,7 @@ def reference(
     no_register: bool,
     output: Path | None,
     overwrite: bool,
-    sensor_files: tuple[Path, Path, Path, Path],
+    sensor_files: tuple[Path, Path, Path, Path] | None,
     as_json: bool,
     quiet: bool,
 ) -> None:
@@ -56,10 +56,10 @@ def reference(
     pixel, and NaN elsewhere. Heights need a CRS and what they refer to: --ellipsoid or --geoid, unless the file says
     so. A CSV file has the columns longitude, latitude, height, or x, y, height with --crs.
 
-    The reference is first moved by its constant shift from OUT/points.tif (easting, northing, height), which is
-    printed with its standard deviation. On flat ground only the height is moved.
+    The reference is first moved by its constant shift from the heights of the run (easting, northing, height), which
+    is printed with its standard deviation. On flat ground only the height is moved.
 
-    Models and grids are those of `triangulate`. Needs shareloc: pip install 'sat-intervals[dsm]'; points other than CSV
+    Models and grids are those of `dsm`. Needs shareloc: pip install 'sat-intervals[dsm]'; points other than CSV
     need pip install 'sat-intervals[reference]'.
     """
     if (heights is None) == (points is None):
@@ -76,7 +76,9 @@ def reference(
     vertical = Vertical(ellipsoid, geoid)
     given = Reference(heights or points, points is not None, vertical, crs)  # type: ignore[arg-type]
     with Console(quiet or as_json) as console:
-        report = make_truth(out, sensor_files, given, path=output, registers=not no_register, progress=console.progress)
+        report = make_truth(
+            out, given, sensor_files=sensor_files, path=output, registers=not no_register, progress=console.progress
+        )
     _say_fit(console, report)
     console.say(
         f"{report['pixels']} pixels with a true disparity ({100 * report['share']:.1f} %), "

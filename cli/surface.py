@@ -16,7 +16,7 @@ from sat_intervals.cli.matching import (
     search_options,
 )
 from sat_intervals.cli.options import FILE, json_option, say_json, sensor_options
-from sat_intervals.cli.triangulate import point_warnings, say_points
+from sat_intervals.cli.triangulate import geometry_warnings
 
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from sat_intervals.run.batch import Finish
 
 # What is made of a run, in its folder.
-_FILES = "points.tif", "dsm.tif"
+_FILES = "geometry.json", "dsm.tif"
 
 
-@click.command(short_help="Match a pair, triangulate it and make a surface model.")
+@click.command(short_help="Match a pair and make a surface model.")
 @search_options
 @pair_options
 @click.argument("out", type=FILE)
@@ -40,18 +40,21 @@ _FILES = "points.tif", "dsm.tif"
 def surface(
     pair: PairArguments,
     out: Path,
-    sensor_files: tuple[Path, Path, Path, Path],
+    sensor_files: tuple[Path, Path, Path, Path] | None,
     cells: dict[str, Any],
     as_json: bool,
     settings: SettingsArguments,
     run: RunArguments,
 ) -> None:
-    """Match the epipolar images LEFT and RIGHT, triangulate the run, and write its surface model to OUT/dsm.tif.
+    """Match the epipolar images LEFT and RIGHT and write the surface model of the run to OUT/dsm.tif.
 
-    The same as `match`, `triangulate` and `dsm`, with their options and files. To resume, rerun the same command: a
-    finished match with these images and settings is kept, points and surface are made again.
+    The same as `match` and `dsm`, with their options and files. To resume, rerun the same command: a finished match
+    with these images and settings is kept, the surface is made again.
     """
     from sat_intervals.cli.console import Console
+
+    if sensor_files is None:
+        raise click.UsageError("give --left-model, --right-model, --left-grid and --right-grid.")
 
     config = settings.load()
     with Console(run.quiet or as_json) as console:
@@ -61,14 +64,13 @@ def surface(
         _check_kept(out, cells, [*sensor_files, *pair.files], settings.file)
         left, right = pair.open()
         report = run.match(left, right, out, config, window=pair.window, progress=console.progress)
-        points, made = _points_and_surface(out, sensor_files, cells, console)
+        made = _surface(out, sensor_files, cells, console)
     if as_json:
-        say_json({"run": report, "points": points, "surface": made})
+        say_json({"run": report, "surface": made})
     console.summary(report, out)
-    say_points(console, points)
     say_surface(console, made)
     console.say(str(out / "dsm.tif"))
-    run.check_strict([*report["warnings"], *point_warnings(points)])
+    run.check_strict([*report["warnings"], *geometry_warnings(made["geometry"])])
 
 
 def _check_kept(
@@ -86,7 +88,7 @@ def _check_kept(
 
 
 def _check_kept_by_all(pairs: "Sequence[PairOfBatch]", out: Path) -> None:
-    """Raise if points or surface of a pair would replace an input of another one."""
+    """Raise if the surface of a pair would replace an input of another one."""
     from sat_intervals.raster.identity import check_not_replaced
 
     images = [file for pair in pairs for file in (pair.left, pair.right, pair.left_mask, pair.right_mask)]
@@ -96,17 +98,13 @@ def _check_kept_by_all(pairs: "Sequence[PairOfBatch]", out: Path) -> None:
     )
 
 
-def _points_and_surface(
+def _surface(
     out: Path, sensor_files: tuple[Any, Any, Any, Any], cells: dict[str, Any], console: "Console"
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Make points and surface of a finished run; return their reports."""
+) -> dict[str, Any]:
+    """Make the surface of a finished run; return its report."""
     from sat_intervals.heights.dsm import make_surface
-    from sat_intervals.heights.triangulate import triangulate
-    from sat_intervals.results import open_run
 
-    run = open_run(out)
-    points = triangulate(run, *sensor_files, console.progress)
-    return points, make_surface([run], out / "dsm.tif", **cells, progress=console.progress)
+    return make_surface([out], out / "dsm.tif", **cells, sensor_files=[sensor_files], progress=console.progress)
 
 
 def _check(cells: dict[str, Any], sensor_files: Sequence[str | Path], interval: "Interval | None") -> None:
@@ -149,7 +147,6 @@ def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -
         if pair.name in errors:
             raise errors[pair.name]
         of_pair = {"resolution": pair.resolution, **cells}
-        points, made = _points_and_surface(out / pair.name, pair.sensors, of_pair, console)
-        return {"points": points, "surface": made}
+        return {"surface": _surface(out / pair.name, pair.sensors, of_pair, console)}
 
     return surface_of

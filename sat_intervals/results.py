@@ -16,7 +16,7 @@ from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.products import BANDS, Bands
 from sat_intervals.raster import Georeferencing, Image, check_not_replaced, open_image, read_layers, read_tags
 from sat_intervals.raster.images import opened
-from sat_intervals.raster.published import is_points_of, is_surface_of, tags_beside
+from sat_intervals.raster.published import is_surface_of, tags_beside
 from sat_intervals.raster.windows import Layer, read_small_image, read_small_layers
 from sat_intervals.tiling import Window, strips
 
@@ -25,7 +25,6 @@ _STRIP = 1 << 23
 _BANDS = {"intervals.tif": len(BANDS), "validity.tif": 1}
 # Files that later commands add to a run: the command, and whether a file is of the run that finished at a time.
 _ADDED: dict[str, tuple[str, Callable[[Path, str], bool]]] = {
-    "points.tif": ("triangulate", is_points_of),
     "dsm.tif": ("dsm", is_surface_of),
     "overview.png": ("plot", lambda file, finished: read_tags(file).get("Comment") == finished),
 }
@@ -82,7 +81,7 @@ class Run:
         command, is_of = _ADDED[name]
         if not (file := self.out / name).exists() or is_of(file, self.report["finished"]):
             return file.exists()
-        _LOG.warning("%s is of another run or of earlier points and is left out: rerun sat-intervals %s", file, command)
+        _LOG.warning("%s is of another run and is left out: rerun sat-intervals %s", file, command)
         return False
 
     def check_kept(self, outputs: Iterable[str | Path], inputs: Iterable[str | Path | None] = ()) -> None:

@@ -2,8 +2,9 @@
 
 import math
 import threading
+from collections import Counter, deque
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -14,12 +15,12 @@ from sat_intervals.heights.point_cloud import Cells, PointCloud
 from sat_intervals.match.histogram import Histogram
 from sat_intervals.tiling import Window
 
-# Cells of a tile: some tens of megabytes.
-_TILE_ROWS, _TILE_COLUMNS = 512, 2048
+# Side of a tile in cells: some hundred megabytes.
+_TILE = 1024
 # Cells of a strip of tiles, 24 bytes each, a few strips in memory; tiles of wide surfaces have fewer rows.
 _STRIP_CELLS, _LOWEST = 1 << 22, 64
-# Points that reach the cells of a tile, for medians: some 60 bytes each.
-_LISTED_POINTS = 1 << 22
+# Bounds listed for the medians of a tile: 8 bytes each.
+_LISTED = 1 << 24
 # Widths are counted in steps of 2 cm, up to so many metres.
 _STEPS, _WIDEST = 50, 1000
 # Metres: half widths from this on are reported as a share.
@@ -28,58 +29,75 @@ WIDE = 20.0
 
 def strips(
     threads: ThreadPoolExecutor, clouds: Sequence[PointCloud], cells: Cells, radius: float, choices: SurfaceChoices
-) -> Iterator[tuple[int, np.ndarray, int]]:
-    """Yield full-width strips from the top: first row, bands of SURFACE ``(6, rows, columns)``, number of poor cells.
+) -> Iterator[tuple[int, np.ndarray, Counter[str]]]:
+    """Yield full-width strips from the top: first row, bands of SURFACE ``(6, rows, columns)``, and counts.
 
-    An error stops the running tiles.
+    Counts are those of `PointCloud.splat` and ``poor_cells``, those left out. An error stops the running tiles.
     """
     ended = threading.Event()
 
-    def tile(window: Window) -> tuple[np.ndarray, int]:
-        bands = fused([cloud.splat(cells, window, radius, ended) for cloud in clouds])
+    def tile(window: Window) -> tuple[np.ndarray, Counter[str]]:
+        gathered, counts = zip(*(cloud.splat(cells, window, radius, ended) for cloud in clouds), strict=True)
+        bands = fused(gathered)
         if choices.calibration is not None:
             calibrate(bands, choices.calibration)
-        return bands, without_poor_cells(bands, choices.max_width, choices.min_confidence)
+        poor = without_poor_cells(bands, choices.max_width, choices.min_confidence)
+        return bands, sum(counts, Counter(poor_cells=poor))
 
-    rows, columns = min(_TILE_ROWS, max(_LOWEST, _STRIP_CELLS // cells.columns)), _TILE_COLUMNS
+    rows, columns = _tile_size(clouds, cells, radius, choices)
+    running: deque[tuple[int, list[Future[tuple[np.ndarray, Counter[str]]]]]] = deque()
+
+    def finished() -> tuple[int, np.ndarray, Counter[str]]:
+        row, tiles = running.popleft()
+        bands, counts = zip(*(future.result() for future in tiles), strict=True)
+        return row, np.concatenate(bands, axis=2), sum(counts, Counter())
+
+    try:
+        for row in range(0, cells.rows, rows):
+            windows = (
+                Window(row, column, rows, columns).clipped(Window(0, 0, cells.rows, cells.columns))
+                for column in range(0, cells.columns, columns)
+            )
+            running.append((row, [threads.submit(tile, window) for window in windows]))
+            if len(running) > 1:  # the next strip is computed while this one is written
+                yield finished()
+        yield finished()
+    except BaseException:
+        ended.set()
+        threads.shutdown(wait=False, cancel_futures=True)
+        raise
+
+
+def _tile_size(clouds: Sequence[PointCloud], cells: Cells, radius: float, choices: SurfaceChoices) -> tuple[int, int]:
+    """Return rows and columns of a tile: as large as memory allows, all of the same size."""
+    rows, columns = min(_TILE, max(_LOWEST, _STRIP_CELLS // cells.columns)), _TILE
     if choices.bounds == "median":
         reaching = max(1.0, math.pi * (radius / cells.resolution) ** 2)
-        of_cell = reaching * max(cloud.points_per_cell(cells.resolution) for cloud in clouds)
-        rows, columns = _smaller(rows, columns, _LISTED_POINTS / of_cell)
-    for row in range(0, cells.rows, rows):
-        height = min(rows, cells.rows - row)
-        windows = (
-            Window(row, column, height, min(columns, cells.columns - column))
-            for column in range(0, cells.columns, columns)
-        )
-        try:
-            bands, poor = zip(*threads.map(tile, windows), strict=True)
-        except BaseException:
-            ended.set()
-            raise
-        yield row, np.concatenate(bands, axis=2), sum(poor)
+        of_cell = reaching * cells.resolution**2 / min(cloud.ground.pixel_area for cloud in clouds)
+        rows = min(rows, max(1, int(math.sqrt(_LISTED / of_cell))))
+        columns = min(columns, max(1, int(_LISTED / of_cell / rows)))
+    return _equal_part(cells.rows, rows), _equal_part(cells.columns, columns)
 
 
-def _smaller(rows: int, columns: int, cells: float) -> tuple[int, int]:
-    """Return rows and columns of a tile of at most so many cells, halving the longer side."""
-    while rows * columns > max(cells, 1):
-        rows, columns = (rows, -(-columns // 2)) if columns >= rows else (-(-rows // 2), columns)
-    return rows, columns
+def _equal_part(whole: int, most: int) -> int:
+    """Return the size of the equal parts of at most so many that a whole has."""
+    return -(-whole // -(-whole // most))
 
 
 class Tally:
     """Count the cells of a surface, and their widths."""
 
     def __init__(self) -> None:
-        self._poor = self._filled = self._shared = self._disagreeing = self._bounded = self._wide = 0
+        self._counts = Counter[str]()
+        self._filled = self._shared = self._disagreeing = self._bounded = self._wide = 0
         self._widths = Histogram(0, _WIDEST, _STEPS)
 
-    def add(self, bands: np.ndarray, poor: int) -> None:
-        """Add cells, and the number of those left out as poor."""
+    def add(self, bands: np.ndarray, counts: Counter[str]) -> None:
+        """Add cells, and counts of their points, see `strips`."""
         height, lower, upper, *_, agreement = bands
         width = upper - lower
         width = width[np.isfinite(width)]
-        self._poor += poor
+        self._counts += counts
         self._filled += int(np.isfinite(height).sum())
         self._shared += int(np.isfinite(agreement).sum())
         self._disagreeing += int((agreement == 0).sum())
@@ -91,9 +109,9 @@ class Tally:
         """Return the figures, see `make_surface`, with shares of so many cells."""
         median = self._widths.median()
         return {
+            **{name: self._counts[name] for name in ("points", "outliers", "open", "poor_cells")},
             "filled": self._filled / cells,
             "disagreeing": self._disagreeing / self._shared if self._shared else None,
             "median_half_width": None if median is None else median / 2,
             "wide": self._wide / self._bounded if self._bounded else None,
-            "poor_cells": self._poor,
         }

@@ -1,16 +1,16 @@
-"""Make a surface model with height intervals from the points of runs; cells without a point are no data."""
+"""Make a surface model with height intervals from runs; cells without a point are no data."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sat_intervals.config import Calibration, Interval, surface_key
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.cells import Tally, strips
 from sat_intervals.heights.choices import SurfaceChoices
-from sat_intervals.heights.point_cloud import Cells, Extent, PointCloud
-from sat_intervals.heights.points import point_near_the_middle, triangulated
+from sat_intervals.heights.lattice import joined, on_map
+from sat_intervals.heights.point_cloud import Cells, PointCloud
 from sat_intervals.machine import usable_cores
 from sat_intervals.progress import Progress
 from sat_intervals.raster import (
@@ -23,11 +23,14 @@ from sat_intervals.raster import (
     surface_file,
     utm_of,
 )
-from sat_intervals.results import Run
+from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
 
-# More cells per point mean a wrong resolution or runs of different places.
-_CELLS_PER_POINT = 1000
+if TYPE_CHECKING:
+    from sat_intervals.heights.geometry import Geometry
+
+# More cells per pixel mean a wrong resolution or runs of different places.
+_CELLS_PER_PIXEL = 1000
 # Largest radius in cells: the work grows with its square.
 _REACH = 32
 # Metres: largest cell and largest radius.
@@ -43,14 +46,15 @@ def make_surface(
     radius: float | None = None,
     geoid: str | Path | None = None,
     choices: SurfaceChoices | None = None,
+    sensor_files: Sequence[Sequence[str | Path]] | None = None,
     progress: Progress = lambda stage, done, total: None,
 ) -> dict[str, Any]:
-    """Make a surface model from the points of one or several runs.
+    """Make a surface model from one or several runs.
 
     Parameters
     ----------
     outs
-        Folders of triangulated runs of the same place, or such runs as they were opened.
+        Folders of finished runs of the same place, or runs as they were opened.
     path
         The Cloud-Optimized GeoTIFF to write; an existing file is replaced.
     resolution
@@ -64,6 +68,8 @@ def make_surface(
     choices
         The cell's interval, and what is left out: by default nothing but, with a coverage, points whose interval is
         open. The intervals of several runs are averaged where they meet; else their hull is taken.
+    sensor_files
+        Models and grids of each run, see `triangulate`; by default those of ``geometry.json`` in its folder.
     progress
         Callback, see `Progress`.
 
@@ -73,47 +79,72 @@ def make_surface(
     cells of several runs whose intervals do not overlap, None if there are none), ``without_intervals`` (folders of
     runs without intervals); ``bounds``; ``calibration`` (its name, None without one); ``median_half_width`` (metres)
     and ``wide``, the share of cells with bounds whose half width exceeds 20 m, both None without bounds; ``outliers``,
-    ``open`` and ``poor_cells``, the numbers of points and cells left out.
+    ``open`` and ``poor_cells``, the numbers of points and cells left out; ``geometry``, for each folder, how models and
+    grids fit, see `triangulate`.
 
     Raises
     ------
     SatIntervalsError
-        A run has no points, the CRS or the grid cannot be used, or the file cannot be written.
+        A run has no models and grids, or none that fit, no cell has a height, the CRS or the grid cannot be used, or
+        the file cannot be written.
     """
+    from sat_intervals.heights.geometry import FILE, geometry_of  # needs the extra `dsm`
+
     path, geoid = Path(path), None if geoid is None else Path(geoid)
     given = [geoid, *(files_of(str(resolution)) if isinstance(resolution, Path) and resolution.exists() else ())]
     grid, resolution, crs, radius = checked_cells(resolution, crs, radius, geoid)
-    runs = triangulated(outs)
-    for run in runs:
-        run.check_kept([path], [run.out / "points.tif", *given])
+    runs = _opened(outs)
+    files: Sequence[Sequence[str | Path] | None] = sensor_files or [None] * len(runs)
+    for run, of_run in zip(runs, files, strict=True):
+        run.check_kept([path], [run.out / FILE, *(of_run or ()), *given])
     intervals = [run.config.interval for run in runs]
     choices = (choices or SurfaceChoices()).for_intervals(intervals)
     tags = surface_tags([run.report["finished"] for run in runs], intervals, choices, resolution, radius)
     tags["HEIGHTS"] = f"above {geoid or 'the WGS 84 ellipsoid'}"
-    projection = _projection(runs, crs, geoid)
-    clouds = _clouds(runs, projection, choices, progress)
-    cells = _cells(clouds, resolution, radius, grid)
-    place = north_up(projection.crs, cells.left, cells.top, cells.resolution)
-    writer = OutputWriter(path.parent, [surface_file(path.name)], cells.rows, cells.columns, place, tags)
+    geometries: list[Geometry] = []
+    for run, of_run in zip(runs, files, strict=True):
+        progress("geometry", len(geometries), len(runs))
+        geometries.append(geometry_of(run, of_run))
+    projection = _projection(geometries, crs, geoid)
+    clouds = [
+        PointCloud(run, on_map(geometry.lattice, projection, str(run.out)), choices)
+        for run, geometry in zip(runs, geometries, strict=True)
+    ]
     tally = Tally()
-    with writer, ThreadPoolExecutor(usable_cores()) as threads:
-        for row, bands, poor in strips(threads, clouds, cells, radius, choices):
-            tally.add(bands, poor)
-            writer.write(row, bands)
-            progress("cells", row + bands.shape[1], cells.rows)
-        progress("files", 0, 1)
-        writer.publish()
-        progress("files", 1, 1)
+    with ThreadPoolExecutor(usable_cores()) as threads:
+        if grid:
+            _check_reach(clouds, grid, radius)
+        cells = grid or _cells(threads, clouds, resolution, radius)
+        place = north_up(projection.crs, cells.left, cells.top, cells.resolution)
+        with OutputWriter(path.parent, [surface_file(path.name)], cells.rows, cells.columns, place, tags) as writer:
+            for row, bands, counts in strips(threads, clouds, cells, radius, choices):
+                tally.add(bands, counts)
+                writer.write(row, bands)
+                progress("cells", row + bands.shape[1], cells.rows)
+            progress("files", 0, 1)
+            writer.publish()
+            progress("files", 1, 1)
     return {
         "crs": projection.crs,
         "rows": cells.rows,
         "columns": cells.columns,
-        **{name: sum(getattr(cloud, name) for cloud in clouds) for name in ("points", "outliers", "open")},
         **tally.report(cells.rows * cells.columns),
         "bounds": choices.bounds,
         "calibration": choices.calibration and choices.calibration.name,
         "without_intervals": [str(run.out) for run in runs if run.config.interval is None],
+        "geometry": {str(run.out): geometry.report for run, geometry in zip(runs, geometries, strict=True)},
     }
+
+
+def _opened(outs: Sequence[str | Path | Run]) -> list[Run]:
+    """Open runs, unless they are open; raise if one is given twice."""
+    runs: list[Run] = []
+    for given in outs:
+        run = given if isinstance(given, Run) else open_run(given)
+        if known := [one.out for one in runs if one.report["finished"] == run.report["finished"]]:
+            raise SatIntervalsError(f"{known[0]} and {run.out} are the same run: give each run once")
+        runs.append(run)
+    return runs
 
 
 def checked_cells(
@@ -162,21 +193,11 @@ def surface_tags(
     return tags | {"REGISTERED": "yes" if calibration.registered else "no"}
 
 
-def _projection(runs: Sequence[Run], crs: str | None, geoid: Path | None) -> Projection:
-    middle = point_near_the_middle(runs)
+def _projection(geometries: "Sequence[Geometry]", crs: str | None, geoid: Path | None) -> Projection:
+    middle = geometries[0].lattice.middle
     projection = Projection(crs or utm_of(*middle), geoid)
     projection.check(*middle)
     return projection
-
-
-def _clouds(
-    runs: Sequence[Run], projection: Projection, choices: SurfaceChoices, progress: Progress
-) -> list[PointCloud]:
-    clouds = []
-    for done, run in enumerate(runs):
-        progress("extent", done, len(runs))
-        clouds.append(PointCloud(run, projection, choices))
-    return clouds
 
 
 def _grid_of(path: Path, given: str | None) -> tuple[Cells, str]:
@@ -196,21 +217,26 @@ def _grid_of(path: Path, given: str | None) -> tuple[Cells, str]:
     return Cells(place.transform.c, place.transform.f, across, rows, columns), crs
 
 
-def _cells(clouds: Sequence[PointCloud], resolution: float, radius: float, grid: Cells | None) -> Cells:
-    extents = [cloud.extent for cloud in clouds if cloud.extent is not None]
-    if not extents:
-        raise SatIntervalsError("all points were left out as outliers or open intervals: leave out fewer")
-    if grid is not None:
-        window = Window(0, 0, grid.rows, grid.columns)
-        if not any(extent.grown(radius).intersects(grid.extent(window)) for extent in extents):
-            raise SatIntervalsError("no point reaches the grid of the given raster: give one of the same place")
-        return grid
-    left, bottom, right, top = zip(*extents, strict=True)
-    cells = Cells.over(Extent(min(left), min(bottom), max(right), max(top)).grown(radius), resolution)
-    points = sum(cloud.points for cloud in clouds)
-    if cells.rows * cells.columns > _CELLS_PER_POINT * points:
+def _cells(threads: ThreadPoolExecutor, clouds: Sequence[PointCloud], resolution: float, radius: float) -> Cells:
+    """Return the cells that the points of all runs reach."""
+    extent = joined(cloud.extent(threads) for cloud in clouds)
+    if extent is None:
         raise SatIntervalsError(
-            f"{cells.rows} x {cells.columns} cells of {resolution:g} m for {points} points: "
+            f"no valid pixel in {', '.join(str(cloud.run.out) for cloud in clouds)}, or all points are left out as "
+            "outliers or open intervals: give runs with valid pixels, or leave out fewer"
+        )
+    cells = Cells.over(extent.grown(radius), resolution)
+    pixels = sum(cloud.run.region.height * cloud.run.region.width for cloud in clouds)
+    if cells.rows * cells.columns > _CELLS_PER_PIXEL * pixels:
+        raise SatIntervalsError(
+            f"{cells.rows} x {cells.columns} cells of {resolution:g} m for {pixels} pixels: "
             "choose a coarser --resolution, or runs of one place"
         )
     return cells
+
+
+def _check_reach(clouds: Sequence[PointCloud], grid: Cells, radius: float) -> None:
+    """Raise if no point can reach the cells of a given raster."""
+    place = grid.extent(Window(0, 0, grid.rows, grid.columns)).grown(radius)
+    if not any(True for cloud in clouds for _ in cloud.ground.windows(place)):
+        raise SatIntervalsError("no point reaches the grid of the given raster: give one of the same place")

@@ -1,42 +1,29 @@
-"""Project the points of a run to the map and accumulate them in the cells of a surface model."""
+"""Make the points of a run window by window, and accumulate them in the cells of a surface model."""
 
 import math
 import threading
+from collections import Counter
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
 
-from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.choices import SurfaceChoices
-from sat_intervals.heights.points import POINT, WINDOW, read_points
+from sat_intervals.heights.lattice import WINDOW, Extent, Ground, Lattice, joined
 from sat_intervals.kernels.disparity import median
-from sat_intervals.kernels.splat import BOUNDED, LOWER, UPPER, empty_cells, mean_heights, medians, splat
+from sat_intervals.kernels.splat import BOUNDED, LOWER, UPPER, empty_cells, gather, mean_heights, medians, splat
 from sat_intervals.products import OPEN_ABOVE, OPEN_BELOW
-from sat_intervals.raster import Projection
 from sat_intervals.results import Run
-from sat_intervals.tiling import Grid, Window
+from sat_intervals.tiling import Grid, Tile, Window
 
 # Pixels around a point whose median outliers are compared with.
 _NEAR = 2
-
-
-class Extent(NamedTuple):
-    """A rectangle in map coordinates, in metres."""
-
-    left: float
-    bottom: float
-    right: float
-    top: float
-
-    def intersects(self, other: "Extent") -> bool:
-        """Return whether both share a point."""
-        meets = max(self.left, other.left) <= min(self.right, other.right)
-        return meets and max(self.bottom, other.bottom) <= min(self.top, other.top)
-
-    def grown(self, margin: float) -> "Extent":
-        """Return the rectangle grown by a margin on all sides."""
-        return Extent(self.left - margin, self.bottom - margin, self.right + margin, self.top + margin)
+# The height among the values of a lattice.
+_HEIGHT = slice(2, 3)
 
 
 @dataclass(frozen=True)
@@ -66,119 +53,121 @@ class Cells:
         )
 
 
+class _Points(NamedTuple):
+    """Points of a window of pixels, each ``(rows, columns)``; metres, NaN height where none contributes."""
+
+    x: np.ndarray
+    y: np.ndarray
+    height: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    confidence: np.ndarray
+
+
 class PointCloud:
-    """The points of one run that contribute, read by windows, and the map extent of each window.
+    """The points of a run on a map, made window by window where they are needed."""
 
-    ``points``, ``outliers`` and ``open`` count points that contribute, outliers, and other points that are left out
-    because their interval is open at an end of the search range.
-    """
-
-    def __init__(self, run: Run, projection: Projection, choices: SurfaceChoices) -> None:
-        self.run = run
-        self._path = run.out / "points.tif"
-        self._projection = projection
+    def __init__(self, run: Run, lattice: Lattice, choices: SurfaceChoices) -> None:
+        """``lattice`` is that of the run, see `on_map`."""
+        self.run, self.ground = run, Ground(lattice)
         self._choices = choices
-        self._extents: list[tuple[Window, Extent]] = []
-        self.points = self.outliers = self.open = 0
-        for tile in Grid(Window(0, 0, *run.shape), WINDOW):
-            self._scan(tile.core)
 
-    def _kept(self, window: Window) -> tuple[np.ndarray, np.ndarray, int, int]:
-        """Return the bands of a window, the mask of the points that contribute, and the numbers left out."""
-        bands, known = read_points(self._path, window)
-        outlying = open_ended = np.zeros(known.shape, np.bool_)
+    def extent(self, threads: ThreadPoolExecutor) -> Extent | None:
+        """Return the extent of the points that contribute; None if there are none.
+
+        The outermost windows are read first, and those that cannot reach beyond what is found are not.
+        """
+        found = None
+        tiles = Grid(Window(0, 0, *self.run.shape), WINDOW)
+        from_the_rim = partial(_from_the_rim, tiles)
+        for _, ring in groupby(sorted(tiles, key=from_the_rim), from_the_rim):
+            possible = ((tile.core, self.ground.extent(tile.core)) for tile in ring)
+            windows = [window for window, extent in possible if extent and not (found and found.contains(extent))]
+            found = joined([found, *threads.map(self._extent, windows)])
+        return found
+
+    def _extent(self, window: Window) -> Extent | None:
+        points, _ = self._points(window)
+        x, y = (values[np.isfinite(points.height)] for values in (points.x, points.y))
+        return Extent(float(x.min()), float(y.min()), float(x.max()), float(y.max())) if x.size else None
+
+    def splat(
+        self, cells: Cells, window: Window, radius: float, ended: threading.Event
+    ) -> tuple[np.ndarray, Counter[str]]:
+        """Accumulate the points in a window of cells, see `kernels.splat`; ``radius`` in metres; ``ended`` stops it.
+
+        Also return the numbers of ``points`` that fall in these cells, and of those there that are left out as
+        ``outliers`` or because their interval is ``open``.
+        """
+        gathered, counts = empty_cells(window.height, window.width), Counter[str]()
+        near = []
+        place, reach = cells.extent(window), radius / cells.resolution
+        for source in self.ground.windows(place.grown(radius)):
+            if ended.is_set():
+                break
+            points, left_out = self._points(source)
+            column, row = (points.x - place.left) / cells.resolution, (place.top - points.y) / cells.resolution
+            inside = (column >= 0) & (column < window.width) & (row >= 0) & (row < window.height)
+            for name, mask in (("points", np.isfinite(points.height)), *left_out.items()):
+                counts[name] += int(np.count_nonzero(mask & inside))
+            # positions as float32: a ten-thousandth of a cell, in half the memory
+            placed = [column.astype(np.float32).ravel(), row.astype(np.float32).ravel()]
+            placed += [values.ravel() for values in points[2:]]
+            splat(*placed, reach, gathered)
+            if self._choices.bounds == "median":
+                near.append(_within(placed[:5], window, max(reach, 0.5)))
+        if self._choices.bounds == "median":
+            _set_medians(gathered, near, reach)
+        return gathered, counts
+
+    def _points(self, window: Window) -> tuple[_Points, dict[str, np.ndarray]]:
+        """Return the points of a window, and the masks of those left out by the reason."""
+        bands, lattice = self.run.read_bands(window), self.ground.lattice
+        x, y, height = lattice.points(window, np.where(bands.valid, bands.disparity, np.float32(np.nan)))
+        # Which bound gives the higher point depends on the geometry of the pair.
+        (one,), (other,) = (lattice.points(window, bound, _HEIGHT) for bound in (bands.lower, bands.upper))
+        left_out: dict[str, np.ndarray] = {}
         if self._choices.outliers is not None:
-            outlying = known & self._outlying(window, self._choices.outliers)
+            left_out["outliers"] = self._outlying(window, self._choices.outliers)
+            height[left_out["outliers"]] = np.nan
         if not self._choices.keeps_open:
-            validity = self.run.read_bands(window).validity.astype(np.int64)
-            open_ended = known & ~outlying & (validity & (OPEN_BELOW | OPEN_ABOVE) != 0)
-        return bands, known & ~outlying & ~open_ended, int(outlying.sum()), int(open_ended.sum())
+            left_out["open"] = np.isfinite(height) & (bands.validity & np.uint16(OPEN_BELOW | OPEN_ABOVE) != 0)
+            height[left_out["open"]] = np.nan
+        return _Points(x, y, height, np.minimum(one, other), np.maximum(one, other), bands.confidence), left_out
 
     def _outlying(self, window: Window, limit: float) -> np.ndarray:
         """Return the mask of points farther than a limit (metres) from the median of the points near them."""
         around = window.grown(_NEAR, _NEAR).clipped(Window(0, 0, *self.run.shape))
-        bands, known = read_points(self._path, around)
-        height = np.where(known, bands[POINT["height"]], 0)
+        bands = self.run.read_bands(around)
+        disparity = np.where(bands.valid, bands.disparity, np.float32(np.nan))
+        (height,) = self.ground.lattice.points(around, disparity, _HEIGHT)
+        known = np.isfinite(height)
         base = np.median(height[known]) if known.any() else 0  # float32 then keeps millimetres
-        away = np.abs(height - base - median((height - base).astype(np.float32), known, 2 * _NEAR + 1))
-        return np.asarray((away > limit)[window.relative_to(around).slices])
-
-    def _scan(self, window: Window) -> None:
-        """Count the points of a window and find their extent."""
-        bands, known, outliers, open_ended = self._kept(window)
-        longitude, latitude = bands[POINT["longitude"]], bands[POINT["latitude"]]
-        self.points += int(known.sum())
-        self.outliers += outliers
-        self.open += open_ended
-        if known.any():
-            longitude, latitude = longitude[known], latitude[known]
-            if np.isnan(self._projection.undulation(longitude, latitude)).any():
-                raise SatIntervalsError(
-                    f"the grid of geoid heights does not cover the points of {self.run.out}, at longitudes "
-                    f"{longitude.min():.4f} to {longitude.max():.4f}, latitudes {latitude.min():.4f} to "
-                    f"{latitude.max():.4f}: give one that covers them"
-                )
-            x, y = self._projection.place(longitude, latitude)
-            if not (np.isfinite(x).all() and np.isfinite(y).all()):
-                raise SatIntervalsError(
-                    f"points of {self.run.out} are outside the domain of {self._projection.crs}: give another CRS"
-                )
-            self._extents.append((window, Extent(x.min(), y.min(), x.max(), y.max())))
-
-    @property
-    def extent(self) -> Extent | None:
-        """Return the extent of all points; None if there are none."""
-        if not self._extents:
-            return None
-        left, bottom, right, top = zip(*(extent for _, extent in self._extents), strict=True)
-        return Extent(min(left), min(bottom), max(right), max(top))
-
-    def points_per_cell(self, resolution: float) -> float:
-        """Return the mean number of points in a cell with points, by its side in metres."""
-        areas = ((e.right - e.left) * (e.top - e.bottom) for _, e in self._extents)
-        return max(self.points * resolution**2 / max(sum(areas), resolution**2), 1e-9)
-
-    def splat(self, cells: Cells, window: Window, radius: float, ended: threading.Event) -> np.ndarray:
-        """Accumulate the points in a window of cells, see `kernels.splat`; ``radius`` in metres; ``ended`` stops it."""
-        gathered = empty_cells(window.height, window.width)
-        near = []
-        place, reach = cells.extent(window), radius / cells.resolution
-        for source, extent in self._extents:
-            if ended.is_set():
-                break
-            if extent.grown(radius).intersects(place):
-                bands, known, _, _ = self._kept(source)
-                longitude, latitude, height, lower, upper = (
-                    bands[POINT[name]][known]
-                    for name in ("longitude", "latitude", "height", "height_lower", "height_upper")
-                )
-                confidence = self.run.read_bands(source).confidence
-                x, y = self._projection.place(longitude, latitude)
-                down = self._projection.undulation(longitude, latitude)
-                points = (
-                    (x - place.left) / cells.resolution, (place.top - y) / cells.resolution,
-                    height - down, lower - down, upper - down,
-                )  # fmt: skip
-                splat(*points, confidence[known].astype(np.float64), reach, gathered)
-                if self._choices.bounds == "median":
-                    near.append(_within(points, window, max(reach, 0.5)))
-        if near:
-            _set_medians(gathered, np.concatenate(near, axis=1), reach)
-        return gathered
+        away = np.where(known, height - base, 0)
+        away = np.abs(away - median(away.astype(np.float32), known, 2 * _NEAR + 1))
+        return np.asarray((known & (away > limit))[window.relative_to(around).slices])
 
 
-def _within(points: tuple[np.ndarray, ...], window: Window, reach: float) -> np.ndarray:
-    """Return column, row and both bounds of the points with bounds within reach of a window: ``(4, n)``."""
-    column, row, _, lower, upper = points
+def _from_the_rim(tiles: Grid, tile: Tile) -> int:
+    """Return the number of tiles between a tile and the rim."""
+    ends = tile.grid_row, tile.grid_column, tiles.rows - 1 - tile.grid_row, tiles.columns - 1 - tile.grid_column
+    return min(ends)
+
+
+def _within(points: Sequence[np.ndarray], window: Window, reach: float) -> tuple[np.ndarray, ...]:
+    """Return column, row and both bounds, float32, of the points with bounds within reach of a window: ``(n,)``."""
+    column, row, height, lower, upper = points
     inside = (-reach <= column) & (column <= window.width + reach) & (-reach <= row) & (row <= window.height + reach)
-    inside &= np.isfinite(lower) & np.isfinite(upper)
-    return np.stack([values[inside] for values in (column, row, lower, upper)])
+    inside &= np.isfinite(height + lower + upper)
+    return tuple(values[inside].astype(np.float32) for values in (column, row, lower, upper))
 
 
-def _set_medians(gathered: np.ndarray, points: np.ndarray, reach: float) -> None:
+def _set_medians(gathered: np.ndarray, near: Sequence[tuple[np.ndarray, ...]], reach: float) -> None:
     """Replace the bounds of each cell by the medians over its points, widened to the cell's height."""
-    column, row, *bounds = points
-    height = mean_heights(gathered)
-    for layer, bound, outwards in zip((LOWER, UPPER), bounds, (np.minimum, np.maximum), strict=True):
-        median_bound = medians(column, row, bound, reach, gathered[BOUNDED])
-        gathered[layer] = outwards(median_bound, height)
+    height, counts = mean_heights(gathered), gathered[BOUNDED].astype(np.int64)
+    firsts = counts.cumsum().reshape(counts.shape) - counts
+    for layer, index, outwards in ((LOWER, 2, np.minimum), (UPPER, 3, np.maximum)):
+        bounds, ends = np.empty(counts.sum(), np.float32), firsts.copy()
+        for points in near:
+            gather(points[0], points[1], points[index], reach, ends, bounds)
+        gathered[layer] = outwards(medians(counts, bounds), height)

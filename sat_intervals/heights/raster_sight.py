@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from sat_intervals.heights.sensors import Lattice
+from sat_intervals.heights.lattice import Lattice
 from sat_intervals.kernels.sight import seen_disparities, tops
 from sat_intervals.raster import HeightRaster, Projection
 from sat_intervals.tiling import Window
@@ -28,12 +28,14 @@ class _FarError(Exception):
 class RasterSight:
     """Disparities of a raster of heights, strip by strip.
 
-    ``lattice_of`` returns the `Lattice` of a run over disparities from the first to the second; those of ``search`` are
-    tried first. ``shift`` moves the raster on the map of ``projection``: easting, northing, height in metres.
+    ``lattice_of`` returns the `Lattice` of a run over disparities from the first to the second; ``lattice``, over those
+    of ``search``, is tried first. ``shift`` moves the raster on the map of ``projection``: easting, northing, height in
+    metres.
     """
 
     def __init__(
         self,
+        lattice: Lattice,
         lattice_of: Callable[[int, int], Lattice],
         raster: HeightRaster,
         projection: Projection,
@@ -42,7 +44,7 @@ class RasterSight:
     ) -> None:
         self._lattice_of, self._raster, self._projection, self._shift = lattice_of, raster, projection, shift
         self._search = search
-        self._lattice = lattice_of(*search)
+        self._lattice = lattice
         self._heights: dict[int, tuple[float, float]] = {}
         self._steepest = np.tan(np.radians(_STEEPEST)) * raster.cell / raster.frame.unit
 
@@ -74,8 +76,8 @@ class RasterSight:
 
     def _sights(self, window: Window) -> tuple[np.ndarray, tuple[float, float, float], tuple[float, float, float]]:
         """Return lines of sight in cells of the reference, from the highest point, and the place and step of nodes."""
-        nodes, (row, column, disparity) = self._lattice.nodes(window)
-        longitude, latitude, height = (nodes[..., index] for index in range(3))
+        nodes, (row, column, disparity) = self._lattice.around(window)
+        longitude, latitude, height = np.moveaxis(nodes[..., :3], -1, 0)
         x, y = self._projection.place(longitude, latitude)
         east, north, up = self._shift
         longitude, latitude = self._projection.degrees(x - east, y - north)

@@ -1,6 +1,6 @@
 """Turn reference heights into true disparities of a run: ``truth.tif``, for `calibrate` and `evaluate`.
 
-Rasters are seen pixel by pixel; points go through inverse location. Both are registered to the points of the run.
+Rasters are seen pixel by pixel; points go through inverse location. Both are registered to the heights of the run.
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,16 +13,17 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.heights.geometry import FILE, Geometry, geometry_of
+from sat_intervals.heights.lattice import on_map
 from sat_intervals.heights.location import GroundLattice, Location
 from sat_intervals.heights.point_files import PointFile
 from sat_intervals.heights.point_sight import PointSight
-from sat_intervals.heights.points import point_near_the_middle, read_points, triangulated
 from sat_intervals.heights.raster_sight import RasterSight
 from sat_intervals.heights.registering import blocks_of_points, blocks_of_raster
-from sat_intervals.heights.sensors import Lattice, Sensors
+from sat_intervals.heights.sensors import lattice_of
 from sat_intervals.kernels.registration import LEAST, Registration, register
 from sat_intervals.progress import Progress
-from sat_intervals.raster import HeightRaster, OutputWriter, Projection, Vertical, read_layers, truth_file, utm_of
+from sat_intervals.raster import HeightRaster, OutputWriter, Projection, Vertical, truth_file, utm_of
 from sat_intervals.raster.published import tag_of_left
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
@@ -33,8 +34,6 @@ _SAMPLE = 100_000
 _AROUND = 500.0
 # Positions along both axes of a region at which the row misfit is measured.
 _CHECKED = 9
-# Points that are compared with those of the models and grids, and metres between heights that are not the same.
-_COMPARED, _OTHER = 100, 0.1
 # Correlation of disparities and truth below which left and right are swapped, and pixels that it takes.
 _SWAPPED, _ENOUGH = -0.5, 500
 
@@ -51,17 +50,17 @@ class Reference:
 
 def make_truth(
     out: str | Path,
-    sensor_files: Sequence[Path],
     reference: Reference,
     *,
+    sensor_files: Sequence[str | Path] | None = None,
     path: Path | None = None,
     registers: bool = True,
     progress: Progress = lambda stage, done, total: None,
 ) -> dict[str, Any]:
     """Write the disparities that reference heights have in a run, by default to ``truth.tif`` in its folder.
 
-    ``sensor_files`` are those of `triangulate`. With ``registers`` the reference is moved by its constant shift from
-    the points of the run first.
+    ``sensor_files`` are those of `triangulate`. With ``registers`` the reference is first moved by its constant shift
+    from the heights of the run.
 
     Returns ``pixels`` with a true disparity, and their share of the run, ``share``; ``outside_range``, the share of
     them outside the search range; ``row_misfit``, median and largest distance in pixels between the rows at which both
@@ -70,10 +69,8 @@ def make_truth(
     """
     run = open_run(out)
     path = run.out / "truth.tif" if path is None else path
-    run.check_kept([path], [*sensor_files, reference.path, run.out / "points.tif"])
-    if registers:
-        triangulated([run.out])
-    work = _Work(run, Sensors.load(*sensor_files, left=run.left_georeferencing), reference)
+    run.check_kept([path], [*(sensor_files or ()), reference.path, run.out / FILE])
+    work = _Work(run, geometry_of(run, sensor_files), reference)
     found = work.registration(progress) if registers else None
     shift = np.zeros(3) if found is None else found.shift
     tags = {
@@ -100,10 +97,11 @@ def make_truth(
 
 
 class _Work:
-    """A run, its sensors, and the opened reference."""
+    """A run, its geometry, and the opened reference."""
 
-    def __init__(self, run: Run, sensors: Sensors, reference: Reference) -> None:
-        self.run, self._sensors, self._path = run, sensors, reference.path
+    def __init__(self, run: Run, geometry: Geometry, reference: Reference) -> None:
+        sensors = geometry.sensors
+        self.run, self._sensors, self._lattice, self._path = run, sensors, geometry.lattice, reference.path
         search, region = run.config.disparity, run.region
         self._search = search.minimum, search.maximum
         self._location = Location(sensors)
@@ -134,34 +132,18 @@ class _Work:
         pixel = float(np.hypot(x[1] - x[0], y[1] - y[0]))
         return pixel, pixel / float(ends[2, 2] - ends[0, 2])
 
-    def _check_points(self) -> None:
-        """Raise if the points of the run were made with other models or grids."""
-        region, out = self.run.region, self.run.out
-        for window in self.run.windows():
-            points, known = read_points(out / "points.tif", window)
-            row, column = (axis[:: max(1, axis.size // _COMPARED)] for axis in np.nonzero(known))
-            if row.size:
-                disparity = read_layers(out / "intervals.tif", window, band=1)[row, column]
-                made = self._sensors.triangulate(region.row + window.row + row, region.column + column, disparity)
-                if (np.abs(made[:, 2] - points[2, row, column]) > _OTHER).any():
-                    raise SatIntervalsError(
-                        f"{out / 'points.tif'} was made with other models or grids: give these, or triangulate again"
-                    )
-                return
-
     def registration(self, progress: Progress) -> Registration:
-        """Return the shift from the reference to the points of the run."""
-        self._check_points()
+        """Return the shift from the reference to the heights of the run."""
         progress("registration", 0, 1)
-        point_near_the_middle([self.run])  # raises without a point
+        lattice = on_map(self._lattice, self._projection, str(self.run.out))
         if isinstance(self._heights, HeightRaster):
-            blocks = blocks_of_raster(self.run, self._heights, self._projection, self._pixel)
+            blocks = blocks_of_raster(self.run, lattice, self._heights, self._projection, self._pixel)
         else:
-            blocks = blocks_of_points(self.run, self._sample(progress), self._projection, self._pixel)
+            blocks = blocks_of_points(self.run, lattice, self._sample(progress), self._pixel)
         found = register(blocks)
         if found is None:
             raise SatIntervalsError(
-                f"{self._path} has fewer than {LEAST} heights where {self.run.out} has points, at "
+                f"{self._path} has fewer than {LEAST} heights where {self.run.out} has valid pixels, at "
                 f"{_degrees(self.place)}: give a reference of the same place, more points, or --no-register"
             )
         progress("registration", 1, 1)
@@ -197,8 +179,8 @@ class _Work:
         """Yield the first row and the true disparities of strips from the top; points are kept in an empty file."""
         if isinstance(self._heights, HeightRaster):
             right_width = self.run.report["inputs"]["right"]["width"]
-            lattice_of = partial(Lattice, self._sensors, self.run.region, right_width)
-            sight = RasterSight(lattice_of, self._heights, self._projection, shift, self._search)
+            wider = partial(lattice_of, self._sensors, self.run.region, right_width)
+            sight = RasterSight(self._lattice, wider, self._heights, self._projection, shift, self._search)
             strips = sight.strips(self._pixel)
         else:
             strips = self._points_seen(shift, file, progress).strips()
@@ -208,14 +190,14 @@ class _Work:
 
     def _points_seen(self, shift: np.ndarray, file: BinaryIO, progress: Progress) -> PointSight:
         sight = PointSight(file, self.run.region, self._rise)
-        lattice = self._lattice(shift, progress)
+        lattice = self._seen_from(shift, progress)
         if lattice is not None:
             for part in self._near(progress):
                 row, column, _, right = lattice.positions(part + shift).T
                 sight.add(row, column, right - column)
         return sight
 
-    def _lattice(self, shift: np.ndarray, progress: Progress) -> GroundLattice | None:
+    def _seen_from(self, shift: np.ndarray, progress: Progress) -> GroundLattice | None:
         """Return the lattice around all points near the run; None without a point."""
         lowest, highest = np.full(3, np.inf), np.full(3, -np.inf)
         for part in self._near(progress):

@@ -5,8 +5,8 @@ import threading
 import numpy as np
 
 from sat_intervals.heights.choices import SurfaceChoices
-from sat_intervals.heights.point_cloud import Cells, Extent, PointCloud
-from sat_intervals.heights.points import read_points
+from sat_intervals.heights.lattice import Extent, Lattice
+from sat_intervals.heights.point_cloud import Cells, PointCloud
 from sat_intervals.kernels.registration import (
     ACROSS,
     POINTS,
@@ -27,24 +27,32 @@ from sat_intervals.tiling import Window
 _SMALLEST = 24
 
 
-def blocks_of_raster(run: Run, raster: HeightRaster, projection: Projection, pixel: float) -> Blocks | None:
-    """Return points of a run on surfaces of a raster; None if nothing is common. ``pixel`` is metres on the ground."""
+def blocks_of_raster(
+    run: Run, lattice: Lattice, raster: HeightRaster, projection: Projection, pixel: float
+) -> Blocks | None:
+    """Return points of a run on surfaces of a raster; None if nothing is common.
+
+    ``lattice`` is that of `on_map`; ``pixel`` is metres on the ground.
+    """
     cell = max(pixel, raster.cell)
     parts = []
     for window in spread_blocks(Window(0, 0, *run.shape), _SMALLEST):
-        bands, known = read_points(run.out / "points.tif", window)
-        longitude, latitude, height = (band[known] for band in bands[:3])
-        if longitude.size:
-            chosen = every_nth(longitude.size)
-            x, y = projection.place(longitude[chosen], latitude[chosen])
+        bands = run.read_bands(window)
+        points = lattice.points(window, np.where(bands.valid, bands.disparity, np.float32(np.nan)))
+        points = points[:, np.isfinite(points[2])]
+        if points.size:
+            x, y, height = points[:, every_nth(points.shape[1])]
             cells = _around(x, y, cell)
-            parts.append((_on_cells(raster, projection, cells), *_in_cells(cells, x, y), height[chosen]))
+            parts.append((_on_cells(raster, projection, cells), *_in_cells(cells, x, y), height))
     return put_together(parts, cell, moves=1)
 
 
-def blocks_of_points(run: Run, places: np.ndarray, projection: Projection, pixel: float) -> Blocks | None:
-    """Return points, ``(n, 3)`` on the map and above the ellipsoid, on surfaces of a run; None without a point."""
-    cloud = PointCloud(run, projection, SurfaceChoices("envelope").for_intervals([run.config.interval]))
+def blocks_of_points(run: Run, lattice: Lattice, places: np.ndarray, pixel: float) -> Blocks | None:
+    """Return points, ``(n, 3)`` on the map and above the ellipsoid, on surfaces of a run; None without a point.
+
+    ``lattice`` is that of `on_map`; ``pixel`` is metres on the ground.
+    """
+    cloud = PointCloud(run, lattice, SurfaceChoices("envelope").for_intervals([run.config.interval]))
     side = block_side(*run.shape, _SMALLEST) * pixel
     groups, numbers = np.unique(np.floor(places[:, :2] / side), axis=0, return_inverse=True)
     counts = np.bincount(numbers.ravel(), minlength=len(groups))
@@ -52,7 +60,7 @@ def blocks_of_points(run: Run, places: np.ndarray, projection: Projection, pixel
     for group in np.argsort(-counts, kind="stable")[: ACROSS**2]:
         x, y, height = places[numbers.ravel() == group][: 4 * POINTS].T
         cells = _around(x, y, pixel)
-        gathered = cloud.splat(cells, Window(0, 0, cells.rows, cells.columns), pixel, threading.Event())
+        gathered, _ = cloud.splat(cells, Window(0, 0, cells.rows, cells.columns), pixel, threading.Event())
         parts.append((mean_heights(gathered), *_in_cells(cells, x, y), height))
     return put_together(parts, pixel, moves=-1)
 

@@ -5,13 +5,13 @@ import warnings
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError, check_file
+from sat_intervals.heights.lattice import Lattice
 from sat_intervals.kernels.compiled import kernels_of_others
-from sat_intervals.kernels.lattice import interpolate
 from sat_intervals.raster import GROUND, Georeferencing
 from sat_intervals.tiling import Window
 
@@ -33,18 +33,6 @@ _AT_ONCE = 100_000
 _CHECKED = 9
 # Metres: lines of sight of one scene meet within centimetres, those of two scenes miss by hundreds of metres.
 _FOREIGN_RESIDUAL = 10.0
-
-
-class Points(NamedTuple):
-    """Points of some pixels, all ``(rows, columns)`` float64, NaN where there is no disparity.
-
-    Degrees (WGS 84), metres above its ellipsoid, and metres from the point to either line of sight.
-    """
-
-    longitude: np.ndarray
-    latitude: np.ndarray
-    height: np.ndarray
-    residual: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -73,9 +61,10 @@ class Sensors:
         return cls(*models, *grids)
 
     def triangulate(self, row: np.ndarray, column: np.ndarray, disparity: np.ndarray) -> np.ndarray:
-        """Return ``(n, 4)`` longitude, latitude, height and residual, see `Points`, of epipolar positions ``(n,)``.
+        """Return ``(n, 4)`` longitude, latitude, height and residual of epipolar positions ``(n,)``.
 
-        Pixel centres are integers; the right pixel is at ``column + disparity`` of the same row.
+        Degrees (WGS 84), metres above its ellipsoid, and metres from the point to either line of sight. Pixel centres
+        are integers; the right pixel is at ``column + disparity`` of the same row.
         """
         matches = np.column_stack([column, row, column + disparity, row]).astype(np.float64)
         found = [self._triangulate(matches[first : first + _AT_ONCE]) for first in range(0, len(matches), _AT_ONCE)]
@@ -100,52 +89,18 @@ def _read(path: Path, kind: str, reader: Any) -> Any:
         raise SatIntervalsError(f"shareloc cannot read {path} as {kind}: {reason}") from error
 
 
-class Lattice:
-    """Triangulate the nodes of a lattice over rows, columns and disparities, and interpolate points between them.
+def lattice_of(sensors: Sensors, region: Window, right_width: int, minimum: int, maximum: int) -> Lattice:
+    """Triangulate a lattice over the pixels of a region of the left image and a range of disparities.
 
     shareloc needs seconds for a million points. Between nodes 32 pixels apart, interpolation is accurate to less than
-    1 mm. Windows must come from the top: nodes are triangulated row by row, and dropped above the window. ``region`` is
-    the pixels of the left image to cover, ``right_width`` the columns of the right one.
+    1 mm. ``right_width`` is the number of columns of the right image, which its grid must cover.
     """
-
-    def __init__(self, sensors: Sensors, region: Window, right_width: int, minimum: int, maximum: int) -> None:
-        _check_cover(sensors, region, right_width, minimum, maximum)
-        self.residual = _median_residual(sensors, region, minimum, maximum)
-        """Median distance between lines of sight at some positions, in metres."""
-        self._sensors, self.region = sensors, region
-        self._minimum = float(minimum)
-        (self._rows, row_step) = _axis(region.row, region.row_stop - 1)
-        self._columns, column_step = _axis(region.column, region.column_stop - 1)
-        self._disparities, disparity_step = _axis(minimum, maximum)
-        self.spacing = row_step, column_step, disparity_step
-        """Pixels between nodes along rows, columns and disparities."""
-        self._nodes: dict[int, np.ndarray] = {}
-
-    def points(self, window: Window, *disparities: np.ndarray) -> list[Points]:
-        """Return the points of disparity maps ``(rows, columns)`` of a window, relative to the region."""
-        nodes, origin = self.nodes(window)
-        return [
-            Points(*interpolate(nodes, self.spacing, origin, disparity.astype(np.float64))) for disparity in disparities
-        ]
-
-    def nodes(self, window: Window) -> tuple[np.ndarray, tuple[float, float, float]]:
-        """Return rows of nodes around a window, ``(rows, columns, disparities, 4)``, see `Sensors.triangulate`.
-
-        With row, column and disparity of their first from the window's first pixel; nodes are ``spacing`` apart.
-        """
-        step = self.spacing[0]
-        first = min(int(window.row / step), len(self._rows) - 2)
-        last = min(int((window.row_stop - 1) / step) + 1, len(self._rows) - 1)
-        self._nodes = {
-            row: self._nodes[row] if row in self._nodes else self._row(row) for row in range(first, last + 1)
-        }
-        return np.stack(list(self._nodes.values())), (first * step - window.row, -float(window.column), self._minimum)
-
-    def _row(self, row: int) -> np.ndarray:
-        """Triangulate a row of nodes: ``(columns, disparities, 4)``."""
-        column, disparity = np.meshgrid(self._columns, self._disparities, indexing="ij")
-        points = self._sensors.triangulate(np.full(column.size, self._rows[row]), column.ravel(), disparity.ravel())
-        return points.reshape(*column.shape, 4)
+    _check_cover(sensors, region, right_width, minimum, maximum)
+    ends = (region.row, region.row_stop - 1), (region.column, region.column_stop - 1), (minimum, maximum)
+    axes, spacing = zip(*(_axis(*pair) for pair in ends), strict=True)
+    row, column, disparity = (axis.ravel() for axis in np.meshgrid(*axes, indexing="ij"))
+    nodes = sensors.triangulate(row, column, disparity).reshape(*map(len, axes), 4)
+    return Lattice(nodes, spacing, region, float(minimum))
 
 
 def _axis(first: float, last: float) -> tuple[np.ndarray, float]:
@@ -176,7 +131,7 @@ def _check_cover(sensors: Sensors, region: Window, right_width: int, minimum: in
             )
 
 
-def _median_residual(sensors: Sensors, region: Window, minimum: int, maximum: int) -> float:
+def median_residual(sensors: Sensors, region: Window, minimum: int, maximum: int) -> float:
     """Return the median residual at some positions across a region; raise if the models do not fit."""
     rows = np.linspace(region.row, region.row_stop - 1, _CHECKED)
     columns = np.linspace(region.column, region.column_stop - 1, _CHECKED)

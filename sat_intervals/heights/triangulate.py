@@ -1,148 +1,162 @@
-"""Triangulate disparities and bounds of a run, strip by strip: three seconds of processor time a megapixel."""
+"""Export the points of a run, strip by strip: a GeoTIFF of longitude, latitude and heights, or a LAZ file."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.heights.lattice import Lattice, on_map
+from sat_intervals.products import Bands
 from sat_intervals.progress import Progress
-from sat_intervals.raster import POINT_FILES, OutputWriter
-from sat_intervals.results import Run, open_run
+from sat_intervals.raster import Layer, OutputWriter, Projection, new_file, points_file, utm_of
+from sat_intervals.results import Run, open_input, open_run
 from sat_intervals.tiling import Window
-
-if TYPE_CHECKING:
-    from sat_intervals.heights.sensors import Lattice, Points
 
 # Pixels computed at a time, 300 bytes each; pixels read ahead take 18 bytes.
 _PIXELS = 1 << 18
 # Positions are rounded to 0.01 mm on the ground and 0.1 mm in height, below the error of the lattice. This halves the
 # file.
 _DEGREES, _METRES = 2.0**-33, 2.0**-13
+# Metres: step of the coordinates in a LAS or LAZ file.
+_STEP = 0.001
 
 
 def triangulate(
     out: str | Path | Run,
-    left_model: str | Path,
-    right_model: str | Path,
-    left_grid: str | Path,
-    right_grid: str | Path,
+    sensor_files: Sequence[str | Path] | None = None,
+    *,
+    path: str | Path | None = None,
     progress: Progress = lambda stage, done, total: None,
 ) -> dict[str, Any]:
-    """Triangulate a run and write ``points.tif`` to its folder; an existing one is replaced.
+    """Export the points of a run with their height bounds; an existing file is replaced.
 
     Parameters
     ----------
     out
         Folder of the finished run, or the run as it was opened.
-    left_model, right_model
-        RPC models of the sensor images: GeoTIFF with RPC tags, ``.geom`` or DIMAP XML.
-    left_grid, right_grid
-        Epipolar grids: band 1 is the sensor column, band 2 the sensor row. The geotransform gives the epipolar position
-        of each node (convention of shareloc and CARS). Epipolar positions refer to the whole left image. Grids of OTB,
-        known by their tag ``METADATATYPE=OTB``, have displacements instead of positions.
+    sensor_files
+        Left and right model, left and right grid; by default those of ``geometry.json`` in the folder, which is written
+        when they are given. Models are RPC models of the sensor images: GeoTIFF with RPC tags, ``.geom`` or DIMAP XML.
+        Band 1 of an epipolar grid is the sensor column, band 2 the sensor row. The geotransform gives the epipolar
+        position of each node (convention of shareloc and CARS). Epipolar positions refer to the whole left image. Grids
+        of OTB, known by their tag ``METADATATYPE=OTB``, have displacements instead of positions.
+    path
+        The file to write, by default ``points.tif`` in the folder. A name that ends with ``.laz`` or ``.las`` means
+        points in the UTM zone of the run (metres, heights above the ellipsoid) with the intensity of the left image,
+        and ``lower``, ``upper`` (metres) and ``confidence`` as extra dimensions. It needs laspy.
     progress
         Callback, see `Progress`.
 
     Returns
     -------
-    ``points``, the number of points; ``lost``, the number of valid pixels
-    without a point, because grids or models have no values there; ``beyond``, the number of pixels by which the left
-    grid reaches beyond the left image, and the ``grid_step`` in pixels; if there are points, minimum and maximum of
-    ``height`` (metres above the ellipsoid) and ``residual`` (metres); ``median_residual`` (metres) at some positions
-    across the region, far below 0.1 m if models and grids belong to these images, for any disparities.
+    ``points``, the number of points; if there are any, minimum and maximum of ``height`` (metres above the ellipsoid);
+    ``median_residual``, the median distance (metres) between lines of sight at some positions across the region, far
+    below 0.1 m if models and grids belong to these images, for any disparities; ``lost``, the share of the region where
+    grids or models have no values; ``beyond``, the number of pixels by which the left grid reaches beyond the left
+    image, and the ``grid_step`` in pixels.
 
     Raises
     ------
     SatIntervalsError
         The folder is not a run, models or grids cannot be read or do not fit, or the file cannot be written.
     """
-    from sat_intervals.heights.sensors import Lattice, Sensors  # needs the extra `dsm`
+    from sat_intervals.heights.geometry import FILE, geometry_of  # needs the extra `dsm`
 
     run = out if isinstance(out, Run) else open_run(out)
-    run.check_kept([run.out / "points.tif"], [left_model, right_model, left_grid, right_grid])
-    search = run.config.disparity
-    models = map(Path, (left_model, right_model, left_grid, right_grid))
-    sensors = Sensors.load(*models, left=run.left_georeferencing)
-    right_width = run.report["inputs"]["right"]["width"]
-    lattice = Lattice(sensors, run.region, right_width, search.minimum, search.maximum)
-    tags = {"RUN": run.report["finished"], "LEFT_MODEL": str(left_model), "RIGHT_MODEL": str(right_model)}
+    path = run.out / "points.tif" if path is None else Path(path)
+    run.check_kept([path], [run.out / FILE, *(sensor_files or ())])
+    geometry = geometry_of(run, sensor_files)
+    write = _write_las if path.suffix.lower() in (".laz", ".las") else _write_raster
     tally = _Tally()
-    with OutputWriter(run.out, POINT_FILES, *run.shape, run.georeferencing, tags) as writer:
-        for window, disparities in _strips(run):
-            bands = _bands(lattice, window, disparities)
-            writer.write(window.row, bands)
-            tally.add(int(np.isfinite(disparities[0]).sum()), height=bands[2], residual=bands[5])
+    write(run, geometry.lattice, path, tally, progress)
+    return tally.report() | geometry.report
+
+
+def _write_raster(run: Run, lattice: Lattice, path: Path, tally: "_Tally", progress: Progress) -> None:
+    with OutputWriter(path.parent, [points_file(path.name)], *run.shape, run.georeferencing, {}) as writer:
+        for window, bands in _strips(run):
+            layers = _layers(lattice, window, np.where(bands.valid, bands[:3], np.float32(np.nan)))
+            writer.write(window.row, layers)
+            tally.add(layers[2])
             progress("points", window.row_stop, run.shape[0])
         progress("files", 0, 1)
         writer.publish()
         progress("files", 1, 1)
-    return tally.report() | _beyond(sensors.left_grid, run) | {"median_residual": lattice.residual}
 
 
-def _beyond(grid: Any, run: Run) -> dict[str, float]:
-    """Return the largest number of pixels by which a grid reaches beyond the left image, and its largest step."""
-    left, (columns, rows) = run.report["inputs"]["left"], grid.points
-    ends = zip((rows, columns), (left["height"], left["width"]), strict=True)
-    beyond = max(max(float(-nodes[0]), float(nodes[-1]) - (size - 1)) for nodes, size in ends)
-    return {"beyond": beyond, "grid_step": float(max(np.diff(rows).max(), np.diff(columns).max()))}
+def _write_las(run: Run, lattice: Lattice, path: Path, tally: "_Tally", progress: Progress) -> None:
+    try:
+        import laspy
+    except ModuleNotFoundError as error:
+        raise SatIntervalsError(f"{path} needs laspy: pip install 'sat-intervals[reference]'") from error
+    projection = Projection(utm_of(*lattice.middle))
+    lattice = on_map(lattice, projection, str(run.out))
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales, header.offsets = np.full(3, _STEP), np.floor(np.nanmin(lattice.nodes, axis=(0, 1, 2)))
+    header.add_crs(projection.definition)
+    for name, meaning in (("lower", "height bound, metres"), ("upper", "height bound, metres"), ("confidence", "")):
+        header.add_extra_dim(laspy.ExtraBytesParams(name, "float32", meaning))
+    left = Layer(open_input(run.report["inputs"]["left"]), run.region.row, run.region.column)
+    compressed = path.suffix.lower() == ".laz"
+    with new_file(path) as temporary, laspy.open(temporary, "w", header=header, do_compress=compressed) as file:
+        for window, bands in _strips(run):
+            x, y, height = lattice.points(window, np.where(bands.valid, bands.disparity, np.float32(np.nan)))
+            (one,), (other,) = (lattice.points(window, bound, slice(2, 3)) for bound in (bands.lower, bands.upper))
+            known = np.isfinite(height)
+            record = laspy.ScaleAwarePointRecord.zeros(int(known.sum()), header=header)
+            record.x, record.y, record.z = x[known], y[known], height[known]
+            record.intensity = np.clip(np.nan_to_num(left.read(window)[known]), 0, 65535).astype(np.uint16)
+            record["lower"], record["upper"] = np.minimum(one, other)[known], np.maximum(one, other)[known]
+            record["confidence"] = bands.confidence[known]
+            record.return_number[:] = record.number_of_returns[:] = 1
+            file.write_points(record)
+            tally.add(height)
+            progress("points", window.row_stop, run.shape[0])
 
 
 class _Tally:
-    """Count points and valid pixels, and gather minimum and maximum of some bands."""
+    """Count points, and keep the lowest and the highest."""
 
     def __init__(self) -> None:
-        self._points = self._valid = 0
-        self._ends: dict[str, tuple[float, float]] = {}
+        self._points, self._lowest, self._highest = 0, np.inf, -np.inf
 
-    def add(self, valid: int, **bands: np.ndarray) -> None:
-        self._valid += valid
-        for name, band in bands.items():
-            known = band[np.isfinite(band)]
-            if known.size:
-                least, largest = self._ends.get(name, (np.inf, -np.inf))
-                self._ends[name] = min(least, float(known.min())), max(largest, float(known.max()))
+    def add(self, height: np.ndarray) -> None:
+        known = height[np.isfinite(height)]
         self._points += known.size
+        self._lowest = min(self._lowest, known.min(initial=np.inf))
+        self._highest = max(self._highest, known.max(initial=-np.inf))
 
     def report(self) -> dict[str, Any]:
-        return {"points": self._points, "lost": self._valid - self._points, **self._ends}
+        ends = {"height": (float(self._lowest), float(self._highest))} if self._points else {}
+        return {"points": self._points, **ends}
 
 
-def _strips(run: Run) -> Iterator[tuple[Window, np.ndarray]]:
-    """Yield windows of whole rows with disparity, lower and upper ``(3, rows, columns)``, NaN if invalid."""
+def _strips(run: Run) -> Iterator[tuple[Window, Bands]]:
+    """Yield windows of whole rows with their bands."""
     height = max(1, _PIXELS // run.region.width)
     for block in run.windows():
         bands = run.read_bands(block)
-        disparities = np.where(bands.valid, bands[:3], np.float32(np.nan))
         for first in range(0, block.height, height):
-            part = disparities[:, first : first + height]
-            yield Window(block.row + first, 0, part.shape[1], block.width), part
+            part = Bands(*(band[first : first + height] for band in bands[:5]))
+            yield Window(block.row + first, 0, len(part.disparity), block.width), part
 
 
-def _bands(lattice: "Lattice", window: Window, disparities: np.ndarray) -> np.ndarray:
-    """Return the bands of ``points.tif`` for a window."""
-    middle, one, other = lattice.points(window, *disparities)
+def _layers(lattice: Lattice, window: Window, disparities: np.ndarray) -> np.ndarray:
+    """Return the bands of ``points.tif`` for disparity, lower and upper ``(3, rows, columns)`` of a window."""
+    middle, one, other = (lattice.points(window, disparity) for disparity in disparities)
     # Which bound gives the higher point depends on the geometry of the pair.
-    low, high = _ordered(one, other)
-    heights = (point.height for point in (middle, low, high))
-    middle_place, *bound_places = ((point.longitude, point.latitude) for point in (middle, low, high))
+    low, high = np.where(one[2] > other[2], [other, one], [one, other])
     return np.stack(
         [
-            *_rounded(middle_place, _DEGREES),
-            *_rounded(heights, _METRES),
-            middle.residual.astype(np.float32),
-            *(place for places in bound_places for place in _rounded(places, _DEGREES)),
+            *_rounded(middle[:2], _DEGREES),
+            *_rounded((middle[2], low[2], high[2]), _METRES),
+            middle[3].astype(np.float32),
+            *_rounded((*low[:2], *high[:2]), _DEGREES),
         ]
     )
 
 
 def _rounded(bands: Iterable[np.ndarray], step: float) -> Iterator[np.ndarray]:
     return (np.rint(band / step) * step for band in bands)
-
-
-def _ordered(one: "Points", other: "Points") -> tuple["Points", "Points"]:
-    """Return the lower and the higher of two points of each pixel."""
-    swapped = one.height > other.height
-    low = type(one)(*(np.where(swapped, b, a) for a, b in zip(one, other, strict=True)))
-    high = type(one)(*(np.where(swapped, a, b) for a, b in zip(one, other, strict=True)))
-    return low, high

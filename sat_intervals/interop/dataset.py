@@ -11,7 +11,7 @@ from xarray.core import indexing
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import FLAGS, INVALID, flag_attributes
-from sat_intervals.raster import POINT_FILES, RUN_FILES, grid_mapping, read_layers
+from sat_intervals.raster import RUN_FILES, grid_mapping, read_layers
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
 
@@ -54,9 +54,9 @@ def open(out: str | Path, chunks: int | None = 2048) -> xr.Dataset:
     -------
     Dataset
         With the dimensions ``y`` and ``x``: ``disparity``, ``lower``, ``upper``, ``width`` (pixels), ``confidence`` and
-        ``validity``, whose attributes list its flags; and the bands of ``points.tif`` if that is of this run. The
-        coordinate ``spatial_ref`` has CRS and transform by the CF conventions. Attributes are ``finished`` and
-        ``preset``. The accessor ``intervals`` has methods, see `Intervals`.
+        ``validity``, whose attributes list its flags. The coordinate ``spatial_ref`` has CRS and transform by the CF
+        conventions. Attributes are ``finished`` and ``preset``. The accessor ``intervals`` has methods, see
+        `Intervals`.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def open(out: str | Path, chunks: int | None = 2048) -> xr.Dataset:
     dataset.attrs = {"title": "disparity with intervals", "source": "sat-intervals", "finished": run.report["finished"]}
     if run.config.preset:
         dataset.attrs["preset"] = run.config.preset
-    for file in (*RUN_FILES, *(POINT_FILES if run.has_current("points.tif") else ())):
+    for file in RUN_FILES:
         for number, band in enumerate(file.bands, start=1):
             lazy = indexing.LazilyIndexedArray(_Layer(run, file.name, number, file.dtype))
             attributes = {"long_name": band.meaning} | ({"units": band.unit} if band.unit else {})

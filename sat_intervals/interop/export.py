@@ -80,7 +80,7 @@ def export(out: str | Path, form: str, target: str | Path, *, overwrite: bool = 
     rasters = [raster for raster in FORMATS[form] if not raster.section or getattr(run.config, raster.section)]
     files = [raster.file(prefix) for raster in rasters]
     paths = [folder / file.name for file in files]
-    run.check_kept(paths, [run.out / "points.tif"])
+    run.check_kept(paths)
     for path in paths:
         check_free(path, overwrite=overwrite)
     place = Georeferencing(transform=run.left_georeferencing.transform if form == "otb" else None)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.products import BANDS, FLAGS, POINTS, SURFACE, Band
+from sat_intervals.products import BANDS, FLAGS, SURFACE, Band
 from sat_intervals.raster import footprint, read_layers, read_place, write_file
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import strips
@@ -31,7 +31,7 @@ def write_item(out: str | Path, *, taken: str | None = None, identifier: str | N
     """Write ``stac.json`` to the folder of a finished run: a STAC 1.1 item with its rasters as assets.
 
     ``taken`` is when the left image was taken, ISO 8601 with a time zone; by default, when the run ended.
-    ``points.tif``, ``dsm.tif`` and ``overview.png`` are assets if they belong to this run.
+    ``dsm.tif`` and ``overview.png`` are assets if they belong to this run.
     """
     run = open_run(out)
     file = run.out / "stac.json"
@@ -96,8 +96,6 @@ def _assets(run: Run) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the key and the content of each asset; points, surface and maps of other runs are left out."""
     yield "intervals", _raster(run, "intervals.tif", "Disparity, its interval, confidence", BANDS)
     yield "validity", _raster(run, "validity.tif", "Validity flags", (_VALIDITY,))
-    if run.has_current("points.tif"):
-        yield "points", _raster(run, "points.tif", "Longitude, latitude and height of every pixel", POINTS)
     if run.has_current("dsm.tif"):
         yield "dsm", _raster(run, "dsm.tif", "Surface model with intervals", SURFACE)
     report = {"title": "Settings, inputs, counts, times, versions", "type": "application/json", "roles": ["metadata"]}

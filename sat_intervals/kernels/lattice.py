@@ -24,7 +24,7 @@ def interpolate(lattice, spacing, first, disparity):
     for r in range(rows):
         y = (r - first[0]) / spacing[0]
         i = min(max(int(np.floor(y)), 0), lattice.shape[0] - 2)
-        y -= i
+        nodes = lattice[i] + (y - i) * (lattice[i + 1] - lattice[i])  # of this row of pixels
         for c in range(columns):
             if np.isnan(disparity[r, c]):
                 continue
@@ -35,9 +35,7 @@ def interpolate(lattice, spacing, first, disparity):
             k = min(max(int(np.floor(z)), 0), lattice.shape[2] - 2)
             z -= k
             for v in range(values):
-                near = (1 - x) * lattice[i, j, k, v] + x * lattice[i, j + 1, k, v]
-                far = (1 - x) * lattice[i + 1, j, k, v] + x * lattice[i + 1, j + 1, k, v]
-                near_up = (1 - x) * lattice[i, j, k + 1, v] + x * lattice[i, j + 1, k + 1, v]
-                far_up = (1 - x) * lattice[i + 1, j, k + 1, v] + x * lattice[i + 1, j + 1, k + 1, v]
-                result[v, r, c] = (1 - z) * ((1 - y) * near + y * far) + z * ((1 - y) * near_up + y * far_up)
+                near = (1 - x) * nodes[j, k, v] + x * nodes[j + 1, k, v]
+                far = (1 - x) * nodes[j, k + 1, v] + x * nodes[j + 1, k + 1, v]
+                result[v, r, c] = (1 - z) * near + z * far
     return result

@@ -69,21 +69,29 @@ def splat(column, row, height, lower, upper, confidence, radius, cells):
                     cells[UPPER, i, j] = max(cells[UPPER, i, j], upper[n])
 
 
-@cached
-def medians(column, row, bound, radius, counts):
-    """Median bound of the points that reach each cell, by the rule of `splat`: ``(rows, columns)``, NaN without any.
+@inlined
+def _sort(values):
+    """Sort in place: by insertion where they are few, which takes half the time."""
+    if values.size > 64:
+        values.sort()
+        return
+    for n in range(1, values.size):
+        value, place = values[n], n
+        while place > 0 and values[place - 1] > value:
+            values[place] = values[place - 1]
+            place -= 1
+        values[place] = value
 
-    column, row, bound: ``(n,)`` of the points with bounds.
-    counts: ``(rows, columns)``, the number of these points that reach each cell, the layer BOUNDED.
+
+@cached
+def gather(column, row, bound, radius, ends, bounds):
+    """Append the bounds of points to those of each cell that they reach, by the rule of `splat`.
+
+    column, row, bound: ``(n,)`` of points with bounds.
+    ends: ``(rows, columns)`` int64, updated: the place in ``bounds`` after the last of each cell.
+    bounds: ``(total,)``, updated: the bounds of the first cell, of the second, and so on.
     """
-    rows, columns = counts.shape
-    ends = np.empty((rows, columns), np.int64)  # of each cell's bounds in `bounds`, where they are filled in
-    total = 0
-    for i in range(rows):
-        for j in range(columns):
-            ends[i, j] = total
-            total += int(counts[i, j])
-    bounds = np.empty(total, bound.dtype)
+    rows, columns = ends.shape
     for n in range(bound.size):
         u, v = column[n] - 0.5, row[n] - 0.5
         for i in range(*_around(v, radius, rows)):
@@ -91,12 +99,24 @@ def medians(column, row, bound, radius, counts):
                 if _reaches(i - v, j - u, radius):
                     bounds[ends[i, j]] = bound[n]
                     ends[i, j] += 1
+
+
+@cached
+def medians(counts, bounds):
+    """Median of the bounds of each cell, which are sorted in place: ``(rows, columns)``, NaN without any.
+
+    counts: ``(rows, columns)``, the number of bounds of each cell, the layer BOUNDED.
+    bounds: ``(total,)``, see `gather`.
+    """
+    rows, columns = counts.shape
     result = np.full((rows, columns), np.nan)
+    first = 0
     for i in range(rows):
         for j in range(columns):
             count = int(counts[i, j])
             if count:
-                own = bounds[ends[i, j] - count : ends[i, j]]
-                own.sort()
+                own = bounds[first : first + count]
+                _sort(own)
                 result[i, j] = (own[(count - 1) // 2] + own[count // 2]) / 2
+                first += count
     return result

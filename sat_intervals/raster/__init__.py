@@ -2,7 +2,7 @@
 
 from sat_intervals.raster.blocks import BLOCK, codec_versions, compressed, factors
 from sat_intervals.raster.cog import Part
-from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, ranges_file, run_files, surface_file, truth_file
+from sat_intervals.raster.files import RUN_FILES, File, points_file, ranges_file, run_files, surface_file, truth_file
 from sat_intervals.raster.files_of import files_of
 from sat_intervals.raster.frame import Frame, Vertical
 from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing, footprint
@@ -35,7 +35,6 @@ from sat_intervals.raster.writer import OutputWriter
 __all__ = [
     "BLOCK",
     "GROUND",
-    "POINT_FILES",
     "RUN_FILES",
     "ControlPoint",
     "File",
@@ -69,6 +68,7 @@ __all__ = [
     "north_up",
     "open_image",
     "part_bytes",
+    "points_file",
     "ranges_file",
     "read_heights",
     "read_known",

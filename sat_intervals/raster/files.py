@@ -45,12 +45,16 @@ _VALIDITY = Band("validity", "", f"sum of bits; a pixel is valid where (validity
 INTERVALS = File("intervals.tif", "float32", float("nan"), BANDS)
 VALIDITY = File("validity.tif", "uint16", None, (_VALIDITY,), _FLAG_TAGS)
 RUN_FILES = (INTERVALS, VALIDITY)
-POINT_FILES = (File("points.tif", "float64", float("nan"), POINTS, predictor="FLOATING_POINT"),)
 
 
 def run_files(compression: str) -> tuple[File, File]:
     """Return the files of a run with a compression of the settings."""
     return replace(INTERVALS, compression=compression), replace(VALIDITY, compression=compression)
+
+
+def points_file(name: str) -> File:
+    """Return the properties of a file of points."""
+    return File(name, "float64", float("nan"), POINTS, predictor="FLOATING_POINT")
 
 
 def surface_file(name: str) -> File:

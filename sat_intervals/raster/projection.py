@@ -60,7 +60,7 @@ class Projection:
             raise SatIntervalsError(
                 f"{crs} ({target.name}) includes heights: give a horizontal CRS, and a geoid with --geoid"
             )
-        self.crs = crs
+        self.crs, self.definition = crs, target
         self._area = target.area_of_use
         self._proj = Proj(target)
         self._map = Transformer.from_crs(_GEOGRAPHIC, target, always_xy=True)

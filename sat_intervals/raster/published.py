@@ -13,11 +13,6 @@ _LEFT = "LEFT_SHA256"
 _LOG = logging.getLogger(__name__)
 
 
-def is_points_of(points: Path, run: str) -> bool:
-    """Return whether points are of a run, by the time when it finished."""
-    return read_tags(points).get("RUN") == run
-
-
 def is_surface_of(surface: Path, run: str) -> bool:
     """Return whether a surface model has points of a run, by the time when it finished."""
     return run in read_tags(surface).get("RUNS", "").split()

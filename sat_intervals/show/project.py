@@ -13,7 +13,7 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.products import BANDS, POINTS, SURFACE
+from sat_intervals.products import BANDS, SURFACE
 from sat_intervals.raster import (
     Georeferencing,
     open_image,
@@ -66,13 +66,13 @@ class Layer:
 def write_project(out: str | Path) -> list[Path]:
     """Write ``project.qgz`` to the folder of a finished run, and the default styles of its rasters; return the files.
 
-    The project has the images and the truth, disparity, interval width, confidence and validity; if ``points.tif`` and
-    ``dsm.tif`` are of this run, also their heights. Paths in it are relative where the files are local.
+    The project has the images and the truth, disparity, interval width, confidence and validity; if ``dsm.tif`` is
+    of this run, also its heights. Paths in it are relative where the files are local.
     """
     run = open_run(out)
     file = run.out / "project.qgz"
     run.check_kept([file, *(run.out / f"{name}{end}" for name in _STYLED for end in (".qml", ".vrt"))])
-    layers = [*_surface(run), *_points(run), *_results(run)]
+    layers = [*_surface(run), *_results(run)]
     written = {Path(layer.raster.source): layer.raster.virtual for layer in layers if layer.raster.virtual}
     for layer in layers:
         if layer.is_default:
@@ -103,16 +103,6 @@ def _results(run: Run) -> Iterator[Layer]:
         yield Layer(group, "interval width", "upper - lower bound, pixels", width, wide, True)
     ramp = styles.colours(1, disparity, styles.VIRIDIS, unit="px")
     yield Layer(group, "disparity", BANDS[0].meaning, intervals, ramp, True, True)
-
-
-def _points(run: Run) -> Iterator[Layer]:
-    if not run.has_current("points.tif"):
-        return
-    points = Raster(run.out / "points.tif", run.georeferencing, run.shape)
-    bands = read_small_layers(points.source, _fitting(run.shape))
-    for number, ramp in ((6, styles.MAGMA), (3, styles.VIRIDIS)):
-        band, renderer = POINTS[number - 1], styles.colours(number, bands[number - 1], ramp, unit="m")
-        yield Layer("Points", f"{band.name} of points", band.meaning, points, renderer, band.name == "height")
 
 
 def _surface(run: Run) -> Iterator[Layer]:
