@@ -36,7 +36,7 @@ lint: $(READY)
 	$(PYTEST) --quiet tests/test_architecture.py
 
 # The tables of docs/speed.md: this project beside its peers; about fifteen minutes.
-bench: $(VENV)/.has-bench
+bench: $(VENV)/.has-bench,dsm
 	$(BIN)/python tests/benchmarks/table.py
 
 # The tables of docs/speed.md on exact seams; about seven minutes.
@@ -63,8 +63,7 @@ coverage: $(VENV)/.has-mccnn
 pictures: $(VENV)/.has-dsm,plot
 	$(BIN)/sat-intervals demo demo-out --overwrite --quiet
 	$(BIN)/python docs/pictures/demo_cameras.py demo-out
-	$(BIN)/sat-intervals triangulate demo-out --left-model demo-out/left_model.tif --right-model demo-out/right_model.tif --left-grid demo-out/left_grid.tif --right-grid demo-out/right_grid.tif --quiet
-	$(BIN)/sat-intervals dsm demo-out --resolution 1 --quiet
+	$(BIN)/sat-intervals dsm demo-out --resolution 1 --left-model demo-out/left_model.tif --right-model demo-out/right_model.tif --left-grid demo-out/left_grid.tif --right-grid demo-out/right_grid.tif --quiet
 	$(BIN)/sat-intervals plot demo-out --row 640 --columns 300 700 --dpi 72
 	mkdir -p .github/pictures
 	$(BIN)/python docs/pictures/wavefronts.py demo-out/wavefronts.png

@@ -10,12 +10,14 @@ import click
 from sat_intervals.cli.options import (
     FILE,
     Command,
+    SensorFiles,
     json_option,
     log_options,
+    note_geometry,
     overwrite_option,
     quiet_option,
     say_json,
-    sensor_options_of_runs,
+    sensor_options,
     with_options,
 )
 from sat_intervals.cli.triangulate import say_geometry
@@ -122,7 +124,7 @@ def say_surface(console: "Console", report: dict[str, Any]) -> None:
 @calibration_option("--calibration")
 @click.option("--output", type=FILE, help="File to write; default dsm.tif in the first OUT.")
 @overwrite_option
-@sensor_options_of_runs
+@sensor_options
 @json_option
 @quiet_option
 @log_options
@@ -131,7 +133,7 @@ def dsm(
     cells: dict[str, Any],
     output: Path | None,
     overwrite: bool,
-    sensor_files: list[tuple[Path, Path, Path, Path]],
+    sensor_files: list[SensorFiles],
     as_json: bool,
     quiet: bool,
 ) -> None:
@@ -139,8 +141,8 @@ def dsm(
 
     Models are GeoTIFFs with RPC tags, .geom or DIMAP XML files. Grids contain the sensor column and row (bands 1 and 2)
     of epipolar positions, as written by CARS and shareloc, or displacements to them, if OTB's tag METADATATYPE=OTB
-    says so. Give them once: OUT/geometry.json names them for later commands. Swapping both models and grids of left
-    and right is not detected, and inverts the relief. Needs shareloc: pip install 'sat-intervals[dsm]'.
+    says so. Give them once for each OUT: OUT/geometry.json names them for later commands. Swapping both models and
+    grids of left and right is not detected, and inverts the relief. Needs shareloc: pip install 'sat-intervals[dsm]'.
 
     Bands: height, height_lower, height_upper, count, confidence, agreement. Heights refer to the WGS 84 ellipsoid
     unless --geoid is given. A point contributes to its cell and to cells whose centre is within --radius. Other cells
@@ -155,11 +157,10 @@ def dsm(
 
     if output:
         check_free(output, overwrite=overwrite)
-    if sensor_files and len(sensor_files) != len(outs):
-        raise click.UsageError(f"{len(sensor_files)} sets of models and grids for {len(outs)} OUT: give one for each.")
     output = output or outs[0] / "dsm.tif"
     with Console(quiet or as_json) as console:
-        report = make_surface(outs, output, **cells, sensor_files=sensor_files, progress=console.progress)
+        note_geometry(outs, sensor_files)
+        report = make_surface(outs, output, **cells, progress=console.progress)
     if as_json:
         say_json(report)
     say_surface(console, report)

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import wraps
 from inspect import signature
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -87,41 +86,41 @@ truth_option = click.option(
 )
 
 
-def _sensor_options(gather: Callable[..., Any], times: str, **kind_of_option: Any) -> Decorator:
-    texts = (("model", "RPC model of the {} sensor image"), ("grid", "Epipolar grid of the {} image"))
+SensorFiles = tuple[Path, Path, Path, Path]
+"""Left and right RPC model, left and right epipolar grid."""
+
+
+def _sensor_files(**given: tuple[Path, ...]) -> list[SensorFiles]:
+    if len({len(files) for files in given.values()}) > 1:
+        options = ", ".join("--" + name.replace("_", "-") for name in given)
+        raise click.UsageError(f"{options} go together: give all four.")
+    return list(zip(*given.values(), strict=True))
+
+
+def sensor_options(command: Command) -> Command:
+    """Add options for models and grids, to be given once for each run; the command gets a list of `SensorFiles`."""
+    names = [f"{side}_{kind}" for kind in ("model", "grid") for side in ("left", "right")]
+    texts = ("RPC model of the {} sensor image.", "Epipolar grid of the {} image.")
+
+    @wraps(command)
+    def with_files(**given: Any) -> Any:
+        return command(sensor_files=_sensor_files(**{name: given.pop(name) for name in names}), **given)
+
     options = (
-        click.option(f"--{side}-{kind}", type=FILE, help=f"{text.format(side)}{times}.", **kind_of_option)
-        for kind, text in texts
-        for side in ("left", "right")
+        click.option("--" + name.replace("_", "-"), multiple=True, type=FILE, help=text.format(name.partition("_")[0]))
+        for name, text in zip(names, (texts[0], texts[0], texts[1], texts[1]), strict=True)
     )
-    return gathered("sensor_files", gather, *options)
+    return with_options(with_files, *options)
 
 
-def _one_set(
-    left_model: Path | None, right_model: Path | None, left_grid: Path | None, right_grid: Path | None
-) -> tuple[Path, Path, Path, Path] | None:
-    files = left_model, right_model, left_grid, right_grid
-    if not any(files):
-        return None
-    if not all(files):
-        raise click.UsageError("--left-model, --right-model, --left-grid and --right-grid go together: give all four.")
-    return files  # type: ignore[return-value]
+def note_geometry(outs: Sequence[Path], sensor_files: Sequence[SensorFiles]) -> None:
+    """Note the models and grids of runs in their folders, if any are given."""
+    if sensor_files and len(sensor_files) != len(outs):
+        raise click.UsageError(f"{len(sensor_files)} sets of models and grids for {len(outs)} OUT: give one for each.")
+    from sat_intervals.heights.geometry import set_geometry
 
-
-def _sets(
-    left_model: tuple[Path, ...],
-    right_model: tuple[Path, ...],
-    left_grid: tuple[Path, ...],
-    right_grid: tuple[Path, ...],
-) -> list[tuple[Path, Path, Path, Path]]:
-    sets = [_one_set(*files) for files in zip_longest(left_model, right_model, left_grid, right_grid)]
-    return [files for files in sets if files]
-
-
-# The command gets ``sensor_files``, in the order of the library, or None: those that the run's folder remembers.
-sensor_options = _sensor_options(_one_set, "")
-# The command gets a list of them, for several runs.
-sensor_options_of_runs = _sensor_options(_sets, ", once per OUT", multiple=True)
+    for out, files in zip(outs, sensor_files, strict=False):
+        set_geometry(out, *files)
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,10 @@ import click
 
 from sat_intervals.cli.options import (
     FILE,
+    SensorFiles,
     json_option,
     log_options,
+    note_geometry,
     overwrite_option,
     quiet_option,
     say_json,
@@ -46,7 +48,7 @@ def reference(
     no_register: bool,
     output: Path | None,
     overwrite: bool,
-    sensor_files: tuple[Path, Path, Path, Path] | None,
+    sensor_files: list[SensorFiles],
     as_json: bool,
     quiet: bool,
 ) -> None:
@@ -76,9 +78,8 @@ def reference(
     vertical = Vertical(ellipsoid, geoid)
     given = Reference(heights or points, points is not None, vertical, crs)  # type: ignore[arg-type]
     with Console(quiet or as_json) as console:
-        report = make_truth(
-            out, given, sensor_files=sensor_files, path=output, registers=not no_register, progress=console.progress
-        )
+        note_geometry([out], sensor_files)
+        report = make_truth(out, given, path=output, registers=not no_register, progress=console.progress)
     _say_fit(console, report)
     console.say(
         f"{report['pixels']} pixels with a true disparity ({100 * report['share']:.1f} %), "

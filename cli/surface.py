@@ -15,7 +15,7 @@ from sat_intervals.cli.matching import (
     run_options,
     search_options,
 )
-from sat_intervals.cli.options import FILE, json_option, say_json, sensor_options
+from sat_intervals.cli.options import FILE, SensorFiles, json_option, note_geometry, say_json, sensor_options
 from sat_intervals.cli.triangulate import geometry_warnings
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ _FILES = "geometry.json", "dsm.tif"
 def surface(
     pair: PairArguments,
     out: Path,
-    sensor_files: tuple[Path, Path, Path, Path] | None,
+    sensor_files: list[SensorFiles],
     cells: dict[str, Any],
     as_json: bool,
     settings: SettingsArguments,
@@ -53,18 +53,19 @@ def surface(
     """
     from sat_intervals.cli.console import Console
 
-    if sensor_files is None:
-        raise click.UsageError("give --left-model, --right-model, --left-grid and --right-grid.")
+    if len(sensor_files) != 1:
+        raise click.UsageError("give --left-model, --right-model, --left-grid and --right-grid once.")
+    (files,) = sensor_files
 
     config = settings.load()
     with Console(run.quiet or as_json) as console:
         from sat_intervals.config import resolved
 
-        _check(cells, sensor_files, resolved(config).interval)
-        _check_kept(out, cells, [*sensor_files, *pair.files], settings.file)
+        _check(cells, files, resolved(config).interval)
+        _check_kept(out, cells, [*files, *pair.files], settings.file)
         left, right = pair.open()
         report = run.match(left, right, out, config, window=pair.window, progress=console.progress)
-        made = _surface(out, sensor_files, cells, console)
+        made = _surface(out, files, cells, console)
     if as_json:
         say_json({"run": report, "surface": made})
     console.summary(report, out)
@@ -98,13 +99,12 @@ def _check_kept_by_all(pairs: "Sequence[PairOfBatch]", out: Path) -> None:
     )
 
 
-def _surface(
-    out: Path, sensor_files: tuple[Any, Any, Any, Any], cells: dict[str, Any], console: "Console"
-) -> dict[str, Any]:
+def _surface(out: Path, sensor_files: SensorFiles, cells: dict[str, Any], console: "Console") -> dict[str, Any]:
     """Make the surface of a finished run; return its report."""
     from sat_intervals.heights.dsm import make_surface
 
-    return make_surface([out], out / "dsm.tif", **cells, sensor_files=[sensor_files], progress=console.progress)
+    note_geometry([out], [sensor_files])
+    return make_surface([out], out / "dsm.tif", **cells, progress=console.progress)
 
 
 def _check(cells: dict[str, Any], sensor_files: Sequence[str | Path], interval: "Interval | None") -> None:

@@ -7,8 +7,10 @@ import click
 
 from sat_intervals.cli.options import (
     FILE,
+    SensorFiles,
     json_option,
     log_options,
+    note_geometry,
     overwrite_option,
     quiet_option,
     say_json,
@@ -36,7 +38,7 @@ def triangulate(
     out: Path,
     output: Path | None,
     overwrite: bool,
-    sensor_files: tuple[Path, Path, Path, Path] | None,
+    sensor_files: list[SensorFiles],
     as_json: bool,
     quiet: bool,
 ) -> None:
@@ -59,7 +61,8 @@ def triangulate(
         check_free(output, overwrite=overwrite)
     output = output or out / "points.tif"
     with Console(quiet or as_json) as console:
-        report = triangulate(out, sensor_files, path=output, progress=console.progress)
+        note_geometry([out], sensor_files)
+        report = triangulate(out, output, console.progress)
     if as_json:
         say_json(report)
     if report["points"]:

@@ -13,6 +13,7 @@ if typing.TYPE_CHECKING:
     from sat_intervals.errors import RunError, SatIntervalsError
     from sat_intervals.evaluate.disparity import evaluate_run
     from sat_intervals.heights.dsm import make_surface
+    from sat_intervals.heights.geometry import set_geometry
     from sat_intervals.heights.triangulate import triangulate
     from sat_intervals.interop.dataset import decode_flags, open
     from sat_intervals.match.in_memory import match_arrays
@@ -36,6 +37,7 @@ __all__ = [
     "match_pair",
     "open",
     "open_image",
+    "set_geometry",
     "triangulate",
 ]
 
@@ -54,6 +56,7 @@ _HOMES = {
     "match_pair": "run.pair",
     "open": "interop.dataset",
     "open_image": "raster",
+    "set_geometry": "heights.geometry",
     "triangulate": "heights.triangulate",
 }
 

@@ -8,7 +8,7 @@ from rasterio import Env
 from sat_intervals.config import load_config
 from sat_intervals.match.statistics import Tally
 from sat_intervals.products import FLAGS, INVALID, OCCLUSION, Bands
-from sat_intervals.raster import POINT_FILES, RUN_FILES, Georeferencing, gdal, north_up, surface_file, write_layer
+from sat_intervals.raster import RUN_FILES, Georeferencing, gdal, north_up, surface_file, write_layer
 from sat_intervals.show.legend import PIXEL_CLASSES
 
 PLACE = north_up(32631, x=370_000, y=4_830_000, pixel=0.5)
@@ -119,9 +119,3 @@ def write_surface(out, height, agreement=np.nan, runs=FINISHED):
     ones = np.ones_like(height)
     bands = np.stack([height, height - 1, height + 2, ones, 0.5 * ones, agreement * ones])
     write_file(out / "dsm.tif", surface_file("dsm.tif"), bands, PLACE, {"RUNS": runs})
-
-
-def write_points(out, height):
-    """Points of these heights in the folder of a run, as `triangulate` publishes them."""
-    bands = np.stack([np.full_like(height, 1.0), np.full_like(height, 44.0), *[height] * 3, 0 * height, *[height] * 4])
-    write_file(out / "points.tif", POINT_FILES[0], bands, PLACE, {"RUN": FINISHED})

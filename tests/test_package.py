@@ -35,7 +35,7 @@ import sys
 sys.modules["shareloc"] = sys.modules["matplotlib"] = None
 from sat_intervals import *
 try:
-    triangulate("out", *"abcd")
+    import sat_intervals.heights.sensors
 except SatIntervalsError as error:
     print(error)
 """

@@ -18,7 +18,7 @@ from sat_intervals.tiling import Window
 # Side of a tile in cells: some hundred megabytes.
 _TILE = 1024
 # Cells of a strip of tiles, 24 bytes each, a few strips in memory; tiles of wide surfaces have fewer rows.
-_STRIP_CELLS, _LOWEST = 1 << 22, 64
+_STRIP_CELLS, _LOWEST = 3 << 20, 64
 # Bounds listed for the medians of a tile: 8 bytes each.
 _LISTED = 1 << 24
 # Widths are counted in steps of 2 cm, up to so many metres.
@@ -72,10 +72,10 @@ def _tile_size(clouds: Sequence[PointCloud], cells: Cells, radius: float, choice
     """Return rows and columns of a tile: as large as memory allows, all of the same size."""
     rows, columns = min(_TILE, max(_LOWEST, _STRIP_CELLS // cells.columns)), _TILE
     if choices.bounds == "median":
-        reaching = max(1.0, math.pi * (radius / cells.resolution) ** 2)
-        of_cell = reaching * cells.resolution**2 / min(cloud.ground.pixel_area for cloud in clouds)
-        rows = min(rows, max(1, int(math.sqrt(_LISTED / of_cell))))
-        columns = min(columns, max(1, int(_LISTED / of_cell / rows)))
+        reaching = max(1.0, math.pi * (radius / cells.resolution) ** 2)  # cells that a point reaches
+        most = _LISTED / reaching * min(cloud.ground.pixel_area for cloud in clouds) / cells.resolution**2
+        rows = max(1, min(rows, int(math.sqrt(most))))
+        columns = max(1, min(columns, int(most / rows)))
     return _equal_part(cells.rows, rows), _equal_part(cells.columns, columns)
 
 

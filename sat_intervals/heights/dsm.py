@@ -1,14 +1,15 @@
 """Make a surface model with height intervals from runs; cells without a point are no data."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sat_intervals.config import Calibration, Interval, surface_key
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.cells import Tally, strips
 from sat_intervals.heights.choices import SurfaceChoices
+from sat_intervals.heights.geometry import FILE, Geometry, geometry_of
 from sat_intervals.heights.lattice import joined, on_map
 from sat_intervals.heights.point_cloud import Cells, PointCloud
 from sat_intervals.machine import usable_cores
@@ -25,9 +26,6 @@ from sat_intervals.raster import (
 )
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
-
-if TYPE_CHECKING:
-    from sat_intervals.heights.geometry import Geometry
 
 # More cells per pixel mean a wrong resolution or runs of different places.
 _CELLS_PER_PIXEL = 1000
@@ -46,7 +44,6 @@ def make_surface(
     radius: float | None = None,
     geoid: str | Path | None = None,
     choices: SurfaceChoices | None = None,
-    sensor_files: Sequence[Sequence[str | Path]] | None = None,
     progress: Progress = lambda stage, done, total: None,
 ) -> dict[str, Any]:
     """Make a surface model from one or several runs.
@@ -54,7 +51,8 @@ def make_surface(
     Parameters
     ----------
     outs
-        Folders of finished runs of the same place, or runs as they were opened.
+        Folders of finished runs of the same place, or runs as they were opened; `set_geometry` has named models and
+        grids of each.
     path
         The Cloud-Optimized GeoTIFF to write; an existing file is replaced.
     resolution
@@ -68,8 +66,6 @@ def make_surface(
     choices
         The cell's interval, and what is left out: by default nothing but, with a coverage, points whose interval is
         open. The intervals of several runs are averaged where they meet; else their hull is taken.
-    sensor_files
-        Models and grids of each run, see `triangulate`; by default those of ``geometry.json`` in its folder.
     progress
         Callback, see `Progress`.
 
@@ -88,33 +84,20 @@ def make_surface(
         A run has no models and grids, or none that fit, no cell has a height, the CRS or the grid cannot be used, or
         the file cannot be written.
     """
-    from sat_intervals.heights.geometry import FILE, geometry_of  # needs the extra `dsm`
-
     path, geoid = Path(path), None if geoid is None else Path(geoid)
     given = [geoid, *(files_of(str(resolution)) if isinstance(resolution, Path) and resolution.exists() else ())]
     grid, resolution, crs, radius = checked_cells(resolution, crs, radius, geoid)
-    runs = _opened(outs)
-    files: Sequence[Sequence[str | Path] | None] = sensor_files or [None] * len(runs)
-    for run, of_run in zip(runs, files, strict=True):
-        run.check_kept([path], [run.out / FILE, *(of_run or ()), *given])
+    geometries = _geometries(outs, path, given, progress)
+    runs = [geometry.run for geometry in geometries]
     intervals = [run.config.interval for run in runs]
     choices = (choices or SurfaceChoices()).for_intervals(intervals)
     tags = surface_tags([run.report["finished"] for run in runs], intervals, choices, resolution, radius)
     tags["HEIGHTS"] = f"above {geoid or 'the WGS 84 ellipsoid'}"
-    geometries: list[Geometry] = []
-    for run, of_run in zip(runs, files, strict=True):
-        progress("geometry", len(geometries), len(runs))
-        geometries.append(geometry_of(run, of_run))
     projection = _projection(geometries, crs, geoid)
-    clouds = [
-        PointCloud(run, on_map(geometry.lattice, projection, str(run.out)), choices)
-        for run, geometry in zip(runs, geometries, strict=True)
-    ]
+    clouds = [PointCloud(one.run, on_map(one.lattice, projection, str(one.run.out)), choices) for one in geometries]
     tally = Tally()
     with ThreadPoolExecutor(usable_cores()) as threads:
-        if grid:
-            _check_reach(clouds, grid, radius)
-        cells = grid or _cells(threads, clouds, resolution, radius)
+        cells = _checked_grid(clouds, grid, radius) if grid else _cells(threads, clouds, resolution, radius)
         place = north_up(projection.crs, cells.left, cells.top, cells.resolution)
         with OutputWriter(path.parent, [surface_file(path.name)], cells.rows, cells.columns, place, tags) as writer:
             for row, bands, counts in strips(threads, clouds, cells, radius, choices):
@@ -132,19 +115,29 @@ def make_surface(
         "bounds": choices.bounds,
         "calibration": choices.calibration and choices.calibration.name,
         "without_intervals": [str(run.out) for run in runs if run.config.interval is None],
-        "geometry": {str(run.out): geometry.report for run, geometry in zip(runs, geometries, strict=True)},
+        "geometry": {str(one.run.out): one.report for one in geometries},
     }
 
 
-def _opened(outs: Sequence[str | Path | Run]) -> list[Run]:
-    """Open runs, unless they are open; raise if one is given twice."""
+def _geometries(
+    outs: Sequence[str | Path | Run], path: Path, given: Iterable[str | Path | None], progress: Progress
+) -> list[Geometry]:
+    """Open runs, unless they are open, and read their models and grids.
+
+    Raise if a run is given twice, or if the surface would replace one of their files or a given one.
+    """
     runs: list[Run] = []
-    for given in outs:
-        run = given if isinstance(given, Run) else open_run(given)
+    for out in outs:
+        run = out if isinstance(out, Run) else open_run(out)
         if known := [one.out for one in runs if one.report["finished"] == run.report["finished"]]:
             raise SatIntervalsError(f"{known[0]} and {run.out} are the same run: give each run once")
         runs.append(run)
-    return runs
+    geometries: list[Geometry] = []
+    for run in runs:
+        progress("geometry", len(geometries), len(runs))
+        geometries.append(geometry_of(run))
+        run.check_kept([path], [run.out / FILE, *geometries[-1].files, *given])
+    return geometries
 
 
 def checked_cells(
@@ -193,7 +186,7 @@ def surface_tags(
     return tags | {"REGISTERED": "yes" if calibration.registered else "no"}
 
 
-def _projection(geometries: "Sequence[Geometry]", crs: str | None, geoid: Path | None) -> Projection:
+def _projection(geometries: Sequence[Geometry], crs: str | None, geoid: Path | None) -> Projection:
     middle = geometries[0].lattice.middle
     projection = Projection(crs or utm_of(*middle), geoid)
     projection.check(*middle)
@@ -235,8 +228,9 @@ def _cells(threads: ThreadPoolExecutor, clouds: Sequence[PointCloud], resolution
     return cells
 
 
-def _check_reach(clouds: Sequence[PointCloud], grid: Cells, radius: float) -> None:
-    """Raise if no point can reach the cells of a given raster."""
+def _checked_grid(clouds: Sequence[PointCloud], grid: Cells, radius: float) -> Cells:
+    """Return the cells of a given raster; raise if no point can reach them."""
     place = grid.extent(Window(0, 0, grid.rows, grid.columns)).grown(radius)
     if not any(True for cloud in clouds for _ in cloud.ground.windows(place)):
         raise SatIntervalsError("no point reaches the grid of the given raster: give one of the same place")
+    return grid

@@ -1,19 +1,21 @@
-"""Sensor models and epipolar grids of a run: given once, then read from ``geometry.json`` in its folder."""
+"""Sensor models and epipolar grids of a run: given once, then named by ``geometry.json`` in its folder."""
 
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.lattice import Lattice
-from sat_intervals.heights.sensors import Sensors, lattice_of, median_residual
 from sat_intervals.raster import write_file
 from sat_intervals.raster.identity import identity
-from sat_intervals.results import Run
+from sat_intervals.results import Run, open_run
+
+if TYPE_CHECKING:
+    from sat_intervals.heights.sensors import Sensors
 
 FILE = "geometry.json"
 _KINDS = "left_model", "right_model", "left_grid", "right_grid"
@@ -22,31 +24,78 @@ _GIVE = "give --left-model, --right-model, --left-grid and --right-grid"
 
 @dataclass(frozen=True)
 class Geometry:
-    """Models and grids of a run, the points of its lattice, and figures of how they fit, see `triangulate`."""
+    """Models and grids of a run, the points of its lattice, and figures of how they fit, see `set_geometry`."""
 
-    files: tuple[Path, ...]
-    sensors: Sensors
+    run: Run
+    files: list[Path]
+    sensors: "Sensors"
     lattice: Lattice
     report: dict[str, float]
 
 
-def geometry_of(run: Run, files: Sequence[str | Path] | None = None) -> Geometry:
-    """Return the geometry of a run: of the files given, which its folder then remembers, or of those it remembers.
+def set_geometry(
+    out: str | Path | Run,
+    left_model: str | Path,
+    right_model: str | Path,
+    left_grid: str | Path,
+    right_grid: str | Path,
+) -> dict[str, float]:
+    """Note the sensor models and epipolar grids of a run in its folder, for its heights: ``geometry.json``.
 
-    ``files`` are left and right RPC model, left and right epipolar grid, see `triangulate`.
+    Parameters
+    ----------
+    out
+        Folder of the finished run, or the run as it was opened.
+    left_model, right_model
+        RPC models of the sensor images: GeoTIFF with RPC tags, ``.geom`` or DIMAP XML.
+    left_grid, right_grid
+        Epipolar grids: band 1 is the sensor column, band 2 the sensor row. The geotransform gives the epipolar position
+        of each node (convention of shareloc and CARS). Epipolar positions refer to the whole left image. Grids of OTB,
+        known by their tag ``METADATATYPE=OTB``, have displacements instead of positions.
+
+    Returns
+    -------
+    ``median_residual``, the median distance (metres) between lines of sight at some positions across the region, far
+    below 0.1 m if models and grids belong to these images, for any disparities; ``beyond``, the number of pixels by
+    which the left grid reaches beyond the left image, and the ``grid_step`` in pixels.
+
+    Raises
+    ------
+    SatIntervalsError
+        The folder is not a run, or models or grids cannot be read or do not fit.
     """
-    paths = tuple(map(Path, files if files is not None else _remembered(run)))
+    run = out if isinstance(out, Run) else open_run(out)
+    paths = [Path(file) for file in (left_model, right_model, left_grid, right_grid)]
+    run.check_kept([run.out / FILE], paths)
+    _, report = _sensors(run, paths)
+    known = {kind: identity(str(path)) for kind, path in zip(_KINDS, paths, strict=True)}
+    record = {"software": "sat-intervals", "images": _images(run)} | known
+    write_file(run.out / FILE, json.dumps(record, indent=1).encode())
+    return report
+
+
+def geometry_of(run: Run) -> Geometry:
+    """Return the geometry of a run; raise if `set_geometry` was not called for it, or a file has changed since."""
+    from sat_intervals.heights.sensors import lattice_of
+
+    paths = _noted(run)
+    sensors, report = _sensors(run, paths)
+    search = run.config.disparity
+    lattice = lattice_of(sensors, run.region, search.minimum, search.maximum)
+    report["lost"] = float(np.isnan(lattice.nodes[..., 0]).all(axis=2).mean())
+    return Geometry(run, paths, sensors, lattice, report)
+
+
+def _sensors(run: Run, paths: Sequence[Path]) -> "tuple[Sensors, dict[str, float]]":
+    from sat_intervals.heights.sensors import Sensors, check_cover, median_residual  # needs the extra `dsm`
+
     sensors = Sensors.load(*paths, left=run.left_georeferencing)
     search = run.config.disparity.minimum, run.config.disparity.maximum
-    lattice = lattice_of(sensors, run.region, run.report["inputs"]["right"]["width"], *search)
-    report = {"median_residual": median_residual(sensors, run.region, *search), **_beyond(sensors.left_grid, run)}
-    report["lost"] = float(np.isnan(lattice.nodes[..., 0]).all(axis=2).mean())
-    if files is not None:
-        run.check_kept([run.out / FILE], paths)
-        known = {kind: identity(str(path)) for kind, path in zip(_KINDS, paths, strict=True)}
-        record = {"software": "sat-intervals", "images": _images(run)} | known
-        write_file(run.out / FILE, json.dumps(record, indent=1).encode())
-    return Geometry(paths, sensors, lattice, report)
+    check_cover(sensors, run.region, run.report["inputs"]["right"]["width"], *search)
+    return sensors, {
+        "median_residual": median_residual(sensors, run.region, *search),
+        **_beyond(sensors.left_grid, run),
+    }
 
 
 def _images(run: Run) -> list[str]:
@@ -54,7 +103,7 @@ def _images(run: Run) -> list[str]:
     return [image.get("sha256", image["path"]) for image in map(run.report["inputs"].get, ("left", "right"))]
 
 
-def _remembered(run: Run) -> list[str]:
+def _noted(run: Run) -> list[Path]:
     """Return the files that ``geometry.json`` names; raise if there are none, or they are not those that it means."""
     file = run.out / FILE
     try:
@@ -70,7 +119,7 @@ def _remembered(run: Run) -> list[str]:
     for path, record in zip(paths, known, strict=True):
         if identity(path, {path: record}).get("sha256") != record.get("sha256"):
             raise SatIntervalsError(f"{path} has changed since {file} was written: {_GIVE}")
-    return paths
+    return [Path(path) for path in paths]
 
 
 def _beyond(grid: Any, run: Run) -> dict[str, float]:

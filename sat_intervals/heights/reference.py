@@ -3,7 +3,7 @@
 Rasters are seen pixel by pixel; points go through inverse location. Both are registered to the heights of the run.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -52,15 +52,14 @@ def make_truth(
     out: str | Path,
     reference: Reference,
     *,
-    sensor_files: Sequence[str | Path] | None = None,
     path: Path | None = None,
     registers: bool = True,
     progress: Progress = lambda stage, done, total: None,
 ) -> dict[str, Any]:
     """Write the disparities that reference heights have in a run, by default to ``truth.tif`` in its folder.
 
-    ``sensor_files`` are those of `triangulate`. With ``registers`` the reference is first moved by its constant shift
-    from the heights of the run.
+    `set_geometry` has named models and grids of the run. With ``registers`` the reference is first moved by its
+    constant shift from the heights of the run.
 
     Returns ``pixels`` with a true disparity, and their share of the run, ``share``; ``outside_range``, the share of
     them outside the search range; ``row_misfit``, median and largest distance in pixels between the rows at which both
@@ -69,8 +68,9 @@ def make_truth(
     """
     run = open_run(out)
     path = run.out / "truth.tif" if path is None else path
-    run.check_kept([path], [*(sensor_files or ()), reference.path, run.out / FILE])
-    work = _Work(run, geometry_of(run, sensor_files), reference)
+    geometry = geometry_of(run)
+    run.check_kept([path], [*geometry.files, reference.path, run.out / FILE])
+    work = _Work(geometry, reference)
     found = work.registration(progress) if registers else None
     shift = np.zeros(3) if found is None else found.shift
     tags = {
@@ -99,8 +99,8 @@ def make_truth(
 class _Work:
     """A run, its geometry, and the opened reference."""
 
-    def __init__(self, run: Run, geometry: Geometry, reference: Reference) -> None:
-        sensors = geometry.sensors
+    def __init__(self, geometry: Geometry, reference: Reference) -> None:
+        run, sensors = geometry.run, geometry.sensors
         self.run, self._sensors, self._lattice, self._path = run, sensors, geometry.lattice, reference.path
         search, region = run.config.disparity, run.region
         self._search = search.minimum, search.maximum
@@ -178,8 +178,7 @@ class _Work:
     def strips(self, shift: np.ndarray, file: BinaryIO, progress: Progress) -> Iterator[tuple[int, np.ndarray]]:
         """Yield the first row and the true disparities of strips from the top; points are kept in an empty file."""
         if isinstance(self._heights, HeightRaster):
-            right_width = self.run.report["inputs"]["right"]["width"]
-            wider = partial(lattice_of, self._sensors, self.run.region, right_width)
+            wider = partial(lattice_of, self._sensors, self.run.region)
             sight = RasterSight(self._lattice, wider, self._heights, self._projection, shift, self._search)
             strips = sight.strips(self._pixel)
         else:

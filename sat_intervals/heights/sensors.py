@@ -89,13 +89,12 @@ def _read(path: Path, kind: str, reader: Any) -> Any:
         raise SatIntervalsError(f"shareloc cannot read {path} as {kind}: {reason}") from error
 
 
-def lattice_of(sensors: Sensors, region: Window, right_width: int, minimum: int, maximum: int) -> Lattice:
+def lattice_of(sensors: Sensors, region: Window, minimum: int, maximum: int) -> Lattice:
     """Triangulate a lattice over the pixels of a region of the left image and a range of disparities.
 
     shareloc needs seconds for a million points. Between nodes 32 pixels apart, interpolation is accurate to less than
-    1 mm. ``right_width`` is the number of columns of the right image, which its grid must cover.
+    1 mm.
     """
-    _check_cover(sensors, region, right_width, minimum, maximum)
     ends = (region.row, region.row_stop - 1), (region.column, region.column_stop - 1), (minimum, maximum)
     axes, spacing = zip(*(_axis(*pair) for pair in ends), strict=True)
     row, column, disparity = (axis.ravel() for axis in np.meshgrid(*axes, indexing="ij"))
@@ -110,8 +109,8 @@ def _axis(first: float, last: float) -> tuple[np.ndarray, float]:
     return first + step * np.arange(count + 1), step
 
 
-def _check_cover(sensors: Sensors, region: Window, right_width: int, minimum: int, maximum: int) -> None:
-    """Raise if a grid does not cover the images: shareloc extrapolates silently."""
+def check_cover(sensors: Sensors, region: Window, right_width: int, minimum: int, maximum: int) -> None:
+    """Raise if a grid does not cover the images, the right one ``right_width`` wide: shareloc extrapolates silently."""
     rows = region.row, region.row_stop - 1
     columns = region.column, region.column_stop - 1
     seen = max(0, columns[0] + minimum), min(right_width - 1, columns[1] + maximum)

@@ -1,12 +1,13 @@
 """Export the points of a run, strip by strip: a GeoTIFF of longitude, latitude and heights, or a LAZ file."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.heights.geometry import FILE, geometry_of
 from sat_intervals.heights.lattice import Lattice, on_map
 from sat_intervals.products import Bands
 from sat_intervals.progress import Progress
@@ -25,8 +26,6 @@ _STEP = 0.001
 
 def triangulate(
     out: str | Path | Run,
-    sensor_files: Sequence[str | Path] | None = None,
-    *,
     path: str | Path | None = None,
     progress: Progress = lambda stage, done, total: None,
 ) -> dict[str, Any]:
@@ -35,13 +34,7 @@ def triangulate(
     Parameters
     ----------
     out
-        Folder of the finished run, or the run as it was opened.
-    sensor_files
-        Left and right model, left and right grid; by default those of ``geometry.json`` in the folder, which is written
-        when they are given. Models are RPC models of the sensor images: GeoTIFF with RPC tags, ``.geom`` or DIMAP XML.
-        Band 1 of an epipolar grid is the sensor column, band 2 the sensor row. The geotransform gives the epipolar
-        position of each node (convention of shareloc and CARS). Epipolar positions refer to the whole left image. Grids
-        of OTB, known by their tag ``METADATATYPE=OTB``, have displacements instead of positions.
+        Folder of the finished run, or the run as it was opened; `set_geometry` has named its models and grids.
     path
         The file to write, by default ``points.tif`` in the folder. A name that ends with ``.laz`` or ``.las`` means
         points in the UTM zone of the run (metres, heights above the ellipsoid) with the intensity of the left image,
@@ -52,22 +45,17 @@ def triangulate(
     Returns
     -------
     ``points``, the number of points; if there are any, minimum and maximum of ``height`` (metres above the ellipsoid);
-    ``median_residual``, the median distance (metres) between lines of sight at some positions across the region, far
-    below 0.1 m if models and grids belong to these images, for any disparities; ``lost``, the share of the region where
-    grids or models have no values; ``beyond``, the number of pixels by which the left grid reaches beyond the left
-    image, and the ``grid_step`` in pixels.
+    the figures of `set_geometry`, and ``lost``, the share of the region where grids or models have no values.
 
     Raises
     ------
     SatIntervalsError
-        The folder is not a run, models or grids cannot be read or do not fit, or the file cannot be written.
+        The folder is not a run or has no models and grids, or the file cannot be written.
     """
-    from sat_intervals.heights.geometry import FILE, geometry_of  # needs the extra `dsm`
-
     run = out if isinstance(out, Run) else open_run(out)
     path = run.out / "points.tif" if path is None else Path(path)
-    run.check_kept([path], [run.out / FILE, *(sensor_files or ())])
-    geometry = geometry_of(run, sensor_files)
+    geometry = geometry_of(run)
+    run.check_kept([path], [run.out / FILE, *geometry.files])
     write = _write_las if path.suffix.lower() in (".laz", ".las") else _write_raster
     tally = _Tally()
     write(run, geometry.lattice, path, tally, progress)

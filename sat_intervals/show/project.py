@@ -31,7 +31,7 @@ _LONGEST = 1024  # pixels, longest side of what percentiles are taken from
 _MULTIPLY = 6  # QGIS' blend mode
 _CHECKED = "Qt::Checked"
 # Rasters with a default style.
-_STYLED = "intervals", "width", "validity", "points", "dsm", "dsm_half_width"
+_STYLED = "intervals", "width", "validity", "dsm", "dsm_half_width"
 
 _LOG = getLogger(__name__)
 

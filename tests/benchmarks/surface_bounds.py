@@ -17,16 +17,17 @@ import rasterio
 from pyproj import Transformer
 
 from sat_intervals import demo, match_pair
-from sat_intervals.demo import DATUM, PIXEL
+from sat_intervals.demo import PIXEL
 from sat_intervals.evaluate.accuracy import Heights
 from sat_intervals.evaluate.calibration import fitted, held_out
 from sat_intervals.heights.choices import BOUNDS, SurfaceChoices
 from sat_intervals.heights.dsm import make_surface
+from sat_intervals.heights.geometry import set_geometry
 from sat_intervals.kernels.conformal import widened
-from sat_intervals.products import POINTS
-from sat_intervals.raster import POINT_FILES, Georeferencing, OutputWriter, north_up, write_layer
-from sat_intervals.results import open_run
-from sat_intervals.tiling import Window
+from sat_intervals.raster import north_up, write_layer
+
+sys.path.append(str(Path(__file__).parents[1]))
+from cameras import EAST, LATITUDE, LONGITUDE, NORTH, cameras
 
 BUILD = Path("build/surfaces")
 SIZE, SEED = 300, 5
@@ -34,8 +35,6 @@ VIEWS = {0.3: (-0.2, 0.4), 0.5: (-0.4, 0.6), 0.8: (-0.6, 1.0)}
 # Left views of the further pairs, as shares of the distance between both views.
 FURTHER = (-0.6, -0.1, -0.85)
 KINDS = {"town": 0, "slope": 60, "rough": 10}  # metres of relief
-LONGITUDE, LATITUDE = 1.45, 43.6
-EAST, NORTH = 80_700.0, 111_110.0  # metres in a degree there
 CRS = "EPSG:32631"
 OBJECTS, TERRAIN, RANDOM = demo.OBJECTS, demo._terrain, np.random.default_rng
 
@@ -52,7 +51,7 @@ def views_of(ratio):
 
 
 def make_pair(folder, kind, views, number):
-    """Write, match and triangulate a pair with noise of its own, unless done before; return profiles of its rows."""
+    """Write and match a pair with noise of its own and cameras, unless done before; return profiles of its rows."""
 
     def random(seed):
         return RANDOM([*seed, number] if number and seed[1] == 1 else seed)
@@ -60,7 +59,7 @@ def make_pair(folder, kind, views, number):
     demo.VIEWS = views
     demo.OBJECTS = OBJECTS if kind == "town" else ()
     demo._terrain = rough if kind == "rough" else TERRAIN
-    if not (folder / "out" / "points.tif").exists():
+    if not (folder / "out" / "geometry.json").exists():
         with mock.patch.object(np.random, "default_rng", random):
             scene = demo.make_scene(SIZE, SIZE, SEED, relief=KINDS[kind])
         place = north_up(32631, x=370_000, y=4_830_000, pixel=PIXEL)
@@ -70,26 +69,8 @@ def make_pair(folder, kind, views, number):
         search = {"minimum": scene.minimum, "maximum": scene.maximum}
         settings = {"preset": "satellite", "disparity": search, "interval": {"coverage": 0.9}}
         match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
-        write_points(folder / "out", views)
+        set_geometry(folder / "out", *cameras(folder, SIZE, SIZE, views=views))
     return list(demo.profiles(SIZE, SIZE, SEED, 0, 64, KINDS[kind]))
-
-
-def write_points(out, views):
-    """Write the points of a run, as its analytic cameras give them."""
-    run = open_run(out)
-    bands = run.read_bands(Window(0, 0, *run.shape))
-    disparities = np.where(bands.valid, bands[:3], np.nan).astype(np.float64)
-    height, lower, upper = DATUM + disparities / (views[1] - views[0])
-    row, column = np.indices(run.shape)
-    layers = {
-        "longitude": LONGITUDE + (column - views[0] * (height - DATUM)) * PIXEL / EAST,
-        "latitude": np.where(np.isnan(height), np.nan, LATITUDE - row * PIXEL / NORTH),
-        "height": height, "height_lower": lower, "height_upper": upper,
-    }  # fmt: skip
-    points = np.stack([layers.get(band.name, np.zeros(run.shape)) for band in POINTS])
-    with OutputWriter(out, POINT_FILES, *run.shape, Georeferencing(), {"RUN": run.report["finished"]}) as writer:
-        writer.write(0, points)
-        writer.publish()
 
 
 @cache

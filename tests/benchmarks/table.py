@@ -193,6 +193,44 @@ def file_to_file(folder):
         row("the command itself after its tiles, 8000 x 8000, two processes", f"{seconds:.2f} s for {written:.2f} GB")
 
 
+# Prints processor seconds of `match`, `dsm` and `triangulate` with the cameras of the demo, after imports and kernels.
+HEIGHTS = """
+import json, sys, time
+from pathlib import Path
+import sat_intervals.heights.sensors
+from sat_intervals import make_surface, match_pair, set_geometry, triangulate
+folder = Path(sys.argv[1])
+files = [folder / f"{side}_{kind}.tif" for kind in ("model", "grid") for side in ("left", "right")]
+out, search = folder / "out", {"minimum": int(sys.argv[2]), "maximum": int(sys.argv[3])}
+for _ in range(2):
+    marks = [time.process_time()]
+    for step in (
+        lambda: match_pair(folder / "left.tif", folder / "right.tif", out, {"disparity": search}, overwrite=True),
+        lambda: [set_geometry(out, *files), make_surface([out], out / "dsm.tif", resolution=1.0)],
+        lambda: triangulate(out),
+    ):
+        step()
+        marks.append(time.process_time())
+print(json.dumps([end - start for start, end in zip(marks, marks[1:])]))
+"""
+
+
+def heights(folder, size=3000):
+    """Processor time of surface models and points of the demo beside that of matching it."""
+    print()
+    row(f"heights of the demo, {size} x {size}, cells of 1 m, processor time", "s/Mpx", "of `match`")
+    row("---", "---", "---")
+    demo, script = folder / "demo", folder / "heights.py"
+    run([str(Path(sys.executable).with_name("sat-intervals")), "demo", str(demo), "--size", *2 * [str(size)]], CORES)
+    run([sys.executable, str(HERE.parents[1] / "docs" / "pictures" / "demo_cameras.py"), str(demo)], CORES)
+    search = json.loads((demo / "run.json").read_text())["settings"]["disparity"]
+    script.write_text(HEIGHTS)
+    printed = run([sys.executable, str(script), str(demo), str(search["minimum"]), str(search["maximum"])], CORES)[-1]
+    match, *others = json.loads(printed.splitlines()[-1])
+    for name, seconds in zip(("match", "dsm", "triangulate"), (match, *others), strict=True):
+        row(f"`{name}`", f"{seconds / size**2 * 1e6:.2f}", f"{seconds / match:.2f}")
+
+
 def with_coverage(folder):
     """Processor time with a coverage over that with alpha, of runs in turn, since other work changes the speed."""
     print()
@@ -222,6 +260,7 @@ def main():
             "mccnn": mccnn,
             "files": partial(file_to_file, Path(folder)),
             "coverage": partial(with_coverage, Path(folder)),
+            "heights": partial(heights, Path(folder)),
         }
         for name in sys.argv[1:] or parts:
             parts[name]()

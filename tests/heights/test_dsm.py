@@ -9,7 +9,8 @@ from itertools import count
 import numpy as np
 import pytest
 import rasterio
-from finished import write_file, write_run
+from cameras import cameras, sensor_words
+from finished import write_run
 from helpers import COMMAND, invoke, wait_until
 from numpy.testing import assert_allclose, assert_array_equal
 from pyproj import Transformer
@@ -20,37 +21,49 @@ from sat_intervals import SatIntervalsError
 from sat_intervals.config import load_calibration, load_height_calibration
 from sat_intervals.heights.choices import BOUNDS, SurfaceChoices
 from sat_intervals.heights.dsm import make_surface
-from sat_intervals.products import OPEN_ABOVE, POINTS, SURFACE
-from sat_intervals.raster import POINT_FILES, Projection, north_up, write_layer
+from sat_intervals.heights.geometry import Geometry
+from sat_intervals.heights.lattice import Lattice
+from sat_intervals.products import OPEN_ABOVE, SURFACE
+from sat_intervals.raster import Projection, north_up, write_layer
 from sat_intervals.raster.projection import transformed
 
 TO_DEGREES = Transformer.from_crs("EPSG:32631", "EPSG:4326", always_xy=True)
 BAND = {band.name: index for index, band in enumerate(SURFACE)}
 LEFT, TOP = 370_000.0, 4_830_000.0
 MICROSECONDS = count()
+PIXEL, FAR = 4.0, 64.0  # metres of height in a pixel of disparity, and pixels at the ends of the lattice
 
 
-def write_points(folder, x, y, height, lower=1.0, upper=2.0, confidence=0.5, run=None, validity=0):
-    """A run whose pixels are points at map places (metres from LEFT, TOP; y upwards), NaN height for none."""
+@pytest.fixture(autouse=True)
+def _made_up_points(monkeypatch, request):
+    """Runs have the points of `write_points`, not those of models and grids."""
+    if not request.node.get_closest_marker("peer"):
+        monkeypatch.setattr("sat_intervals.heights.dsm.geometry_of", made_up)
+
+
+def made_up(run):
+    nodes = np.load(run.out / "nodes.npy")
+    fit = {"median_residual": 0.0, "lost": 0.0, "beyond": 0.0, "grid_step": 1.0}
+    return Geometry(run, [], None, Lattice(nodes, (1.0, 1.0, 2.0 * FAR), run.region, -FAR), fit)
+
+
+def write_points(folder, x, y, height, lower=1.0, upper=2.0, confidence=0.5, validity=0):
+    """A run whose pixels are points at map places (metres from LEFT, TOP; y upwards), NaN height for none.
+
+    All disparities are 0, and each pixel is a node of the lattice.
+    """
     x, y, height = (np.atleast_2d(np.asarray(values, np.float64)) for values in (x, y, height))
     folder.mkdir(exist_ok=True)
-    bands = np.full((4, *height.shape), 1.0, np.float32)
-    bands[3] = confidence
-    out = write_run(folder, bands, np.broadcast_to(np.uint16(validity), height.shape))
+    nothing = 0 * height
+    confidence = np.broadcast_to(confidence, height.shape)
+    layers = nothing, nothing - np.asarray(lower) / PIXEL, nothing + np.asarray(upper) / PIXEL, confidence
+    out = write_run(folder, np.stack(layers).astype(np.float32), np.broadcast_to(np.uint16(validity), height.shape))
     report = json.loads((out / "run.json").read_text())
     report["finished"] = f"2026-11-21T12:00:00.{next(MICROSECONDS):06d}+00:00"  # it tells runs apart
     (out / "run.json").write_text(json.dumps(report))
-    longitude, latitude = transformed(TO_DEGREES, LEFT + x, TOP + y)
-    nothing = np.isnan(height)
-    layers = dict.fromkeys((band.name for band in POINTS), np.zeros(height.shape)) | {
-        "longitude": longitude,
-        "latitude": latitude,
-        "height": height,
-        "height_lower": height - lower,
-        "height_upper": height + upper,
-    }
-    points = np.stack([np.where(nothing, np.nan, layers[band.name]) for band in POINTS])
-    write_file(out / "points.tif", POINT_FILES[0], points, tags={"RUN": run or report["finished"]})
+    place = transformed(TO_DEGREES, LEFT + x, TOP + y)
+    ends = [np.stack([*place, np.nan_to_num(height) + end * PIXEL, 0 * x], axis=-1) for end in (-FAR, FAR)]
+    np.save(out / "nodes.npy", np.pad(np.stack(ends, axis=2), ((0, 1), (0, 1), (0, 0), (0, 0)), mode="edge"))
     return out
 
 
@@ -155,9 +168,10 @@ def test_make_surface__does_not_depend_on_its_tiles(tmp_path, monkeypatch):
     x, y = random.uniform(0, 40, (2, 12, 12))
     out = write_points(tmp_path / "a", x, -y, random.normal(100, 5, x.shape))
     whole, place, _ = surface_of([out], tmp_path)
-    monkeypatch.setattr("sat_intervals.heights.point_cloud.WINDOW", 7)
-    monkeypatch.setattr("sat_intervals.heights.cells._TILE_ROWS", 20)
-    monkeypatch.setattr("sat_intervals.heights.cells._TILE_COLUMNS", 25)
+    monkeypatch.setattr("sat_intervals.heights.lattice.WINDOW", 7)
+    monkeypatch.setattr("sat_intervals.heights.point_cloud.WINDOW", 5)
+    monkeypatch.setattr("sat_intervals.heights.cells._TILE", 20)
+    monkeypatch.setattr("sat_intervals.heights.cells._LOWEST", 1)
     tiled, same_place, _ = surface_of([out], tmp_path)
     assert place == same_place
     assert_allclose(tiled, whole, atol=1e-4)
@@ -199,7 +213,7 @@ def test_make_surface__heights_do_not_depend_on_the_bounds(tmp_path, monkeypatch
     filled = np.isfinite(wide[0])
     for smaller, larger in ((wide[1], narrow[1]), (narrow[1], narrow[0]), (narrow[0], narrow[2]), (narrow[2], wide[2])):
         assert (smaller <= larger)[filled].all()
-    monkeypatch.setattr("sat_intervals.heights.cells._LISTED_POINTS", 100)  # small tiles
+    monkeypatch.setattr("sat_intervals.heights.cells._LISTED", 100)  # small tiles
     tiled, _, _ = surface_of([out], tmp_path, choices=SurfaceChoices(bounds="median"))
     assert_allclose(tiled, narrow, atol=1e-4)
 
@@ -336,10 +350,13 @@ def test_make_surface__a_point_without_bounds_counts_for_the_height_alone(tmp_pa
 
 
 @pytest.mark.process
+@pytest.mark.peer("shareloc")
 def test_dsm__ends_within_seconds_of_an_interrupt(tmp_path):
-    y, x = np.mgrid[:1000, :1000] * 4.0  # a surface of 16 million cells takes a minute
-    out = write_points(tmp_path / "a", x, -y, np.full_like(x, 10.0))
-    command = [COMMAND, "dsm", out, "--output", tmp_path / "dsm.tif", "--resolution", "1", "--radius", "32"]
+    out = write_run(tmp_path, np.ones((4, 1000, 1000), np.float32), np.zeros((1000, 1000), np.uint16))
+    files = sensor_words(cameras(tmp_path, 1000, 1000))
+    before = sorted(path.name for path in tmp_path.iterdir())
+    # 16 million cells of 1000 points each take a minute
+    command = [COMMAND, "dsm", out, *files, "--output", tmp_path / "dsm.tif", "--resolution", "0.125", "--radius", "4"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         try:
             wait_until(lambda: list(tmp_path.glob(".*")), "a temporary file")
@@ -348,7 +365,7 @@ def test_dsm__ends_within_seconds_of_an_interrupt(tmp_path):
         finally:
             process.kill()
     assert (process.returncode, said.splitlines()[-1].split(";")[0]) == (130, "sat-intervals: interrupted")
-    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
 def test_make_surface__a_wide_radius_leaves_no_cell_without_height(tmp_path):
@@ -388,7 +405,7 @@ def test_make_surface__heights_count_from_a_geoid(tmp_path):
 
 
 def test_make_surface__refuses_a_geoid_that_ends_before_the_points(tmp_path):
-    out = write_points(tmp_path / "a", [0.5, 200_000], [-0.5, -0.5], [100.0, 100.0])
+    out = write_points(tmp_path / "a", [0.5, 0.6, 0.7, 200_000], [-0.5] * 4, [100.0] * 4)
     with pytest.raises(SatIntervalsError, match=r"does not cover the points of .*: give one that covers them"):
         surface_of([out], tmp_path, geoid=write_geoid(tmp_path / "geoid.tif", 49.5))
 
@@ -419,14 +436,10 @@ def test_projection__refuses_a_map_of_another_place(crs):
 
 
 def test_make_surface__what_it_cannot_use_gets_one_line(tmp_path):
-    plain = write_run(tmp_path, np.ones((4, 3, 3), np.float32), np.zeros((3, 3), np.uint16))
-    old = write_points(tmp_path / "old", [0.5], [-0.5], [1.0], run="another")
     empty = write_points(tmp_path / "empty", [0.5], [-0.5], [np.nan])
     far = [write_points(tmp_path / f"far{x}", [x], [-0.5], [1.0]) for x in (0, 200_000)]
     (tmp_path / "geoid.txt").write_text("no grid")
     cases = [
-        ([plain], [], "has no points.tif: run sat-intervals triangulate on it first"),
-        ([old], [], "belongs to an earlier run"),
         ([empty], [], "no valid pixel"),
         (far, [], "choose a coarser --resolution, or runs of one place"),
         ([far[0]], ["--resolution", "-1"], "resolution is -1 m: give one above 0, up to 10000"),
@@ -436,8 +449,10 @@ def test_make_surface__what_it_cannot_use_gets_one_line(tmp_path):
         ([far[0]], ["--radius", "1e9"], "radius is 1e+09 m: give one above 0"),
         ([far[0]], ["--radius", "500"], "radius is 500 m, 500 cells of 1 m: choose at most 32 m, or a coarser"),
         ([far[0], shutil.copytree(far[0], tmp_path / "copy")], [], "are the same run: give each run once"),
-        ([far[0]], ["--output", str(far[0] / "points.tif")], "points.tif exists: choose another name or --overwrite"),
-        ([far[0]], ["--output", str(far[0] / "points.tif"), "--overwrite"], "points.tif is an input"),
+        ([far[0]], ["--output", str(far[0] / "run.json")], "run.json exists: choose another name or --overwrite"),
+        ([far[0]], ["--output", str(far[0] / "run.json"), "--overwrite"], "run.json is an input"),
+        ([far[0]], ["--left-model", "a.tif"], "--right-grid go together: give all four"),
+        (far, sensor_words(["a.tif", "b.tif", "c.tif", "d.tif"]), "1 sets of models and grids for 2 OUT"),
         ([far[0]], ["--output", str(tmp_path)], "is a folder: choose another name"),
         ([far[0]], ["--geoid", str(write_geoid(tmp_path / "wild.tif", -9999.0))], "has -9999 m at longitude 1.39"),
         ([far[0]], ["--geoid", str(write_geoid(tmp_path / "a,@b.tif", 9.0))], "a,@b.tif: PROJ reads no file with a co"),

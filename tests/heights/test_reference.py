@@ -19,8 +19,8 @@ from sat_intervals.demo import DATUM, PIXEL, VIEWS
 from sat_intervals.raster import Projection, Vertical
 
 with suppress(SatIntervalsError):  # without shareloc all tests here are skipped
+    from sat_intervals.heights.geometry import set_geometry
     from sat_intervals.heights.reference import Reference, make_truth
-    from sat_intervals.heights.triangulate import triangulate
 
 pytestmark = [
     pytest.mark.peer("shareloc"),
@@ -98,17 +98,18 @@ def seen_of(heights_at, view):
 
 
 def run_of(folder, height, views=VIEWS):
-    """A triangulated run that shows true heights, and the files of its cameras."""
+    """A run that shows true heights, and the files of its cameras."""
     disparity = (views[1] - views[0]) * (height - DATUM)
     bands = np.stack([disparity, disparity - 1, disparity + 1, np.ones_like(disparity)]).astype(np.float32)
     out = write_run(folder, bands, np.zeros(disparity.shape, np.uint16))
     files = cameras(folder, ROWS, COLUMNS, views=views)
-    triangulate(out, *files)
     return out, files, disparity
 
 
 def truth_of(out, files, path, is_points=False, vertical=None, crs=None, **options):
-    report = make_truth(out, files, Reference(path, is_points, vertical or Vertical(ellipsoid=True), crs), **options)
+    given = Reference(path, is_points, vertical or Vertical(ellipsoid=True), crs)
+    set_geometry(out, *files)
+    report = make_truth(out, given, **options)
     with rasterio.open(out / "truth.tif") as dataset:
         return dataset.read(1), report
 
@@ -377,7 +378,6 @@ def test_reference_command__what_it_cannot_use_gets_one_line(relief, tmp_path):
         ),
         (["--points", metres, "--ellipsoid"], files, "metres.csv has no CRS: give it with --crs"),
         (["--points", tmp_path / "none.las", "--ellipsoid"], files, "none.las: no such file"),
-        (ones, swapped, "points.tif was made with other models or grids: give these, or triangulate again"),
         ([*ones, "--no-register"], swapped, "models and grids of left and right are swapped"),
         ([*ones, "--output", reference, "--overwrite"], files, "is an input"),
     ):
@@ -408,9 +408,8 @@ def test_reference_command__a_surface_gives_the_disparities_of_its_run_back(shar
     pair = folder / "left.tif", folder / "right.tif"
     for step in (
         ("match", *pair, out, "--disparity", -35, 18, "--quiet"),
-        ("triangulate", out, *files),
-        ("dsm", out, "--resolution", 0.5),
-        ("reference", out, "--heights", out / "dsm.tif", *files),
+        ("dsm", out, "--resolution", 0.5, *files),
+        ("reference", out, "--heights", out / "dsm.tif"),
     ):
         result = invoke(*step)
         assert result.exit_code == 0, result.output

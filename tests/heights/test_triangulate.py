@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import rasterio
 from cameras import EAST, LATITUDE, LONGITUDE, NORTH, cameras, grid, sensor_words
-from finished import MAXIMUM, MINIMUM, write_run
+from finished import FINISHED, MAXIMUM, MINIMUM, write_run
 from helpers import invoke, write_pair
+from pyproj import Transformer
 from rasterio.transform import Affine
 from rasterio.warp import reproject
 
@@ -19,11 +20,14 @@ from sat_intervals import SatIntervalsError, match_pair
 from sat_intervals.demo import DATUM, PIXEL, VIEWS, make_scene
 from sat_intervals.heights.dsm import make_surface
 from sat_intervals.products import INVALID, POINTS
+from sat_intervals.raster import Projection
 from sat_intervals.results import open_run
 from sat_intervals.tiling import Window
 
 with suppress(SatIntervalsError):  # without shareloc all tests here are skipped
-    from sat_intervals.heights.sensors import Lattice, Sensors
+    from sat_intervals.heights.geometry import set_geometry
+    from sat_intervals.heights.lattice import Extent, Ground, on_map
+    from sat_intervals.heights.sensors import Sensors, lattice_of
     from sat_intervals.heights.triangulate import triangulate
 
 pytestmark = [
@@ -51,11 +55,13 @@ def test_triangulate__heights_of_an_exact_scene_come_back(tmp_path):
     validity = np.where(np.isnan(truth), 1, 0).astype(np.uint16)
     bands = np.stack([truth, truth - 2.0, truth + 3.0, np.ones_like(truth)]).astype(np.float32)
     out = write_run(tmp_path, bands, validity)
-    report = triangulate(out, *cameras(tmp_path, *truth.shape))
+    set_geometry(out, *cameras(tmp_path, *truth.shape))
+    report = triangulate(out)
     points = read(out / "points.tif")
     known = validity == 0
     assert report["points"] == known.sum()
-    assert report["residual"][1] < 1e-3
+    assert report["median_residual"] < 1e-3
+    assert points[BAND["residual"]][known].max() < 1e-3
     heights = {"height": truth, "height_lower": truth - 2.0, "height_upper": truth + 3.0}
     row, column = np.indices(truth.shape)
     for name, disparity in heights.items():
@@ -109,9 +115,11 @@ def level_run(tmp_path):
 
 def test_triangulate__reads_models_of_dimap(level_run, tmp_path):
     out, (left, right, *grids) = level_run
-    triangulate(out, left, right, *grids)
+    set_geometry(out, left, right, *grids)
+    triangulate(out)
     expected = read(out / "points.tif")
-    triangulate(out, dimap(tmp_path / "left.XML", left, 0), dimap(tmp_path / "right.XML", right, 1), *grids)
+    set_geometry(out, dimap(tmp_path / "left.XML", left, 0), dimap(tmp_path / "right.XML", right, 1), *grids)
+    triangulate(out)
     np.testing.assert_allclose(read(out / "points.tif")[:5], expected[:5], rtol=0, atol=1e-3)
     np.testing.assert_allclose(read(out / "points.tif")[:2], expected[:2], rtol=0, atol=1e-8)
 
@@ -119,7 +127,8 @@ def test_triangulate__reads_models_of_dimap(level_run, tmp_path):
 def test_triangulate__orders_bounds_by_height(level_run):
     # The views change places: height falls as disparity grows.
     out, (left, right, *grids) = level_run
-    triangulate(out, right, left, *grids)
+    set_geometry(out, right, left, *grids)
+    triangulate(out)
     points = read(out / "points.tif")
     assert np.abs(points[BAND["height_lower"]] - (DATUM - 4.0)).max() < 0.01
     assert np.abs(points[BAND["height_upper"]] - (DATUM + 1.5)).max() < 0.01
@@ -131,7 +140,7 @@ def test_triangulate__says_what_shareloc_cannot_do(tmp_path):
     middle = on_the_ground(20, 25, DATUM)[0] - LONGITUDE
     # its iterations run away there: what they end with, NaN or a division by zero, is a matter of the last bit
     with pytest.raises(SatIntervalsError, match=r"scenes across the 180th meridian|cannot use .*: division"):
-        triangulate(out, *cameras(tmp_path, 40, 50, longitude=180 - middle))
+        set_geometry(out, *cameras(tmp_path, 40, 50, longitude=180 - middle))
 
 
 @pytest.fixture(scope="module")
@@ -140,7 +149,8 @@ def matched_scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene")
     scene = make_scene(260, 300, seed=2)
     match_pair(folder / "left.tif", folder / "right.tif", folder / "out", write_pair(folder, scene))
-    triangulate(folder / "out", *cameras(folder, 260, 300))
+    set_geometry(folder / "out", *cameras(folder, 260, 300))
+    triangulate(folder / "out")
     return scene, folder / "out"
 
 
@@ -180,19 +190,55 @@ def test_make_surface__as_many_true_heights_are_inside_cells_as_disparities(matc
     assert inside[filled].mean() >= held
 
 
-def test_lattice__equals_shareloc(shared_data):
-    folder = shared_data / "dsm_picanteo"
-    sensors = Sensors.load(*(folder / name for name in FILES))
-    lattice = Lattice(sensors, Window(0, 0, 1216, 1262), 1262, -35, 18)
-    with (folder / "triangulation_check.csv").open() as stream:
+REGION = Window(0, 0, 1216, 1262)
+
+
+@pytest.fixture(scope="module")
+def real(shared_data):
+    """Models and grids of a real pair, and its lattice."""
+    sensors = Sensors.load(*(shared_data / "dsm_picanteo" / name for name in FILES))
+    return sensors, lattice_of(sensors, REGION, -35, 18)
+
+
+def test_lattice__gives_points_that_were_checked(shared_data, real):
+    with (shared_data / "dsm_picanteo" / "triangulation_check.csv").open() as stream:
         rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(stream)]
     assert len(rows) == 200
     for point in rows:
         window = Window(int(point["row"]), int(point["col"]), 1, 1)
-        (here,) = lattice.points(window, np.array([[point["disparity"]]]))
-        assert abs(here.height[0, 0] - point["height"]) < 1e-3
-        assert abs(here.longitude[0, 0] - point["lon"]) * 88_000 < 1e-3
-        assert abs(here.latitude[0, 0] - point["lat"]) * 111_000 < 1e-3
+        longitude, latitude, height, _ = real[1].points(window, np.array([[point["disparity"]]]))
+        assert abs(height - point["height"]) < 1e-3
+        assert abs(longitude - point["lon"]) * 88_000 < 1e-3
+        assert abs(latitude - point["lat"]) * 111_000 < 1e-3
+
+
+def test_on_map__places_are_those_of_shareloc_and_pyproj(real):
+    sensors, lattice = real
+    random = np.random.default_rng(0)
+    row, column = (random.integers(0, size, 300) for size in (REGION.height, REGION.width))
+    disparity = random.uniform(-35, 18, 300)
+    longitude, latitude, height, _ = sensors.triangulate(row, column, disparity).T
+    for crs in ("EPSG:32631", "EPSG:2154", "EPSG:32632"):
+        x, y = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(longitude, latitude)
+        on_ground = on_map(lattice, Projection(crs), "run")
+        for n in range(300):
+            found = on_ground.points(Window(row[n], column[n], 1, 1), disparity[n : n + 1, None])
+            assert np.hypot(*(found.ravel() - (x[n], y[n], height[n]))[:2]) < 1e-3
+            assert abs(found.ravel()[2] - height[n]) < 1e-3
+
+
+def test_ground__windows_hold_every_point_of_an_extent(real, monkeypatch):
+    monkeypatch.setattr("sat_intervals.heights.lattice.WINDOW", 300)
+    ground = Ground(on_map(real[1], Projection("EPSG:32631"), "run"))
+    disparity = np.random.default_rng(1).uniform(-35, 18, (REGION.height, REGION.width))
+    x, y, _ = ground.lattice.points(REGION, disparity)
+    for left, right, low, high in ((0.3, 0.4, 0.1, 0.7), (0.0, 1.0, 0.0, 0.2), (0.5, 0.5, 0.5, 0.5)):
+        ends = np.quantile(x, (left, right)), np.quantile(y, (low, high))
+        extent = Extent(ends[0][0], ends[1][0], ends[0][1], ends[1][1])
+        inside = (x >= extent.left) & (x <= extent.right) & (y >= extent.bottom) & (y <= extent.top)
+        for window in ground.windows(extent):
+            inside[window.slices] = False
+        assert not inside.any()
 
 
 FILES = ("left.geom", "right.geom", "left_grid.tif", "right_grid.tif")
@@ -213,8 +259,7 @@ def test_commands__a_real_pair_to_a_surface_like_that_of_a_peer(shared_data, tmp
             18,
             "--quiet",
         ),
-        ("triangulate", out, *sensor_words(folder / name for name in FILES)),
-        ("dsm", out, "--resolution", 1),
+        ("dsm", out, "--resolution", 1, *sensor_words(folder / name for name in FILES)),
     ]
     for step in steps:
         result = invoke(*step)
@@ -238,30 +283,14 @@ def test_triangulate__a_region_of_the_image_gives_the_same_points(shared_data, t
     config = {"preset": "paper", **search, "regularization": None, "median": None}
     for name, window in (("whole", Window(500, 400, 200, 240)), ("part", Window(560, 470, 80, 90))):
         match_pair(*pair, tmp_path / name, config, window=window)
-        triangulate(tmp_path / name, *(folder / file for file in FILES))
+        set_geometry(tmp_path / name, *(folder / file for file in FILES))
+        triangulate(tmp_path / name)
     part = read(tmp_path / "part" / "points.tif")
     whole = read(tmp_path / "whole" / "points.tif")[:, 60:140, 70:160]
     same = read(tmp_path / "part" / "intervals.tif")[0] == read(tmp_path / "whole" / "intervals.tif")[0, 60:140, 70:160]
     assert same.mean() > 0.3
     for band, allowed in (("longitude", 1e-8), ("latitude", 1e-8), ("height", 2e-3)):
         assert np.abs(part - whole)[BAND[band]][same].max() < allowed
-
-
-def test_lattice__asks_shareloc_for_few_nodes_at_a_time_and_for_none_twice(shared_data, monkeypatch):
-    folder = shared_data / "dsm_picanteo"
-    sensors = Sensors.load(*(folder / name for name in FILES))
-    region = Window(0, 0, 1216, 1262)
-    lattice = Lattice(sensors, region, 1262, -35, 18)
-    disparity = np.full((region.height, 7), 3.25)
-    monkeypatch.setattr("sat_intervals.heights.sensors._AT_ONCE", 40)
-    counts, ask = [], Sensors._triangulate
-    monkeypatch.setattr(Sensors, "_triangulate", lambda self, some: counts.append(len(some)) or ask(self, some))
-    strips = [lattice.points(Window(row, 30, 19, 7), disparity[row : row + 19])[0] for row in range(0, 1216, 19)]
-    assert max(counts) == 40
-    assert sum(counts) == 39 * 41 * 3  # nodes along rows, columns, disparities
-    (whole,) = Lattice(sensors, region, 1262, -35, 18).points(Window(0, 30, 1216, 7), disparity)
-    for band in range(4):
-        np.testing.assert_allclose(np.concatenate([strip[band] for strip in strips]), whole[band], rtol=1e-12)
 
 
 def test_triangulate_command__what_it_cannot_use_gets_one_line(level_run, tmp_path):
@@ -287,7 +316,7 @@ def test_triangulate_command__what_it_cannot_use_gets_one_line(level_run, tmp_pa
         assert result.exit_code == 2, result.output
         assert message.format(descending=descending) in result.output
         assert result.output.count("\n") == 1
-        assert not (out / "points.tif").exists()
+        assert not {"points.tif", "geometry.json"} & {file.name for file in out.iterdir()}
 
 
 def upside_down(file):
@@ -301,7 +330,7 @@ def test_triangulate_command__warns_of_models_that_nearly_fit(level_run, tmp_pat
     shifted = grid(tmp_path / "shifted.tif", 40, 50, offset=1.5)
     result = invoke("triangulate", out, *sensor_words([*files[:3], shifted]), "--quiet")
     assert result.exit_code == 0, result.output
-    assert "warning: lines of sight miss each other by 0." in result.stderr
+    assert f"warning: {out}: lines of sight miss each other by 0." in result.stderr
     assert result.stdout == ""
     assert invoke("triangulate", out, *sensor_words(files)).stderr == ""
 
@@ -309,12 +338,13 @@ def test_triangulate_command__warns_of_models_that_nearly_fit(level_run, tmp_pat
 @pytest.mark.parametrize("hole", [np.nan, -9999.0])
 def test_triangulate_command__a_hole_in_a_grid_loses_the_points_around_it(level_run, tmp_path, hole):
     out, files = level_run
-    triangulate(out, *files)
+    set_geometry(out, *files)
+    triangulate(out)
     whole = read(out / "points.tif")[BAND["height"]]
     files = [*files[:2], grid(tmp_path / "holed.tif", 40, 50, step=4), files[3]]
     with rasterio.open(files[2], "r+") as file:
         positions = file.read()
-        positions[:, 2, 2] = hole  # of epipolar row and column 0, a node of the lattice
+        positions[:, 2, 2] = hole  # of epipolar row and column 0, one of nine nodes of the lattice
         file.write(positions)
         file.nodata = None if np.isnan(hole) else hole
     result = invoke("triangulate", out, *sensor_words(files))
@@ -322,11 +352,11 @@ def test_triangulate_command__a_hole_in_a_grid_loses_the_points_around_it(level_
     points = read(out / "points.tif")[BAND["height"]]
     lost = np.isnan(points)
     assert 0 < lost.sum() < lost.size
-    assert f"{lost.sum()} valid pixels have no point" in result.stderr
+    assert f"{out}: no points in 11 %: grids or models have no values there" in result.stderr
     np.testing.assert_allclose(points[~lost], whole[~lost], atol=1e-3)
 
 
-def test_surface_command__is_match_triangulate_and_dsm_and_resumes(tmp_path, monkeypatch):
+def test_surface_command__is_match_and_dsm_and_resumes(tmp_path, monkeypatch):
     scene = make_scene(120, 150, seed=4)
     write_pair(tmp_path, scene)
     files = cameras(tmp_path, *scene.truth.shape)
@@ -357,11 +387,10 @@ def test_surface_command__is_match_triangulate_and_dsm_and_resumes(tmp_path, mon
     assert "median half width +-" in result.stdout
     figures = json.loads(invoke(*command, "--json").stdout)
     assert figures["run"] == open_run(out).report
-    assert figures["points"]["points"] > 0
+    assert figures["surface"]["points"] > 0
     assert 0 < figures["surface"]["filled"] <= 1
     assert invoke("match", *images, str(steps), *search, "--quiet").exit_code == 0
-    assert invoke("triangulate", str(steps), *sensors, "--quiet").exit_code == 0
-    assert invoke("dsm", str(steps), "--resolution", "1", "--quiet").exit_code == 0
+    assert invoke("dsm", str(steps), *sensors, "--resolution", "1", "--quiet").exit_code == 0
     assert np.array_equal(read(out / "dsm.tif"), read(steps / "dsm.tif"), equal_nan=True)
     other = invoke(*command, "--preset", "paper")
     assert (other.exit_code, "already holds another run" in other.stderr) == (2, True)
@@ -402,30 +431,78 @@ def test_batch_command__rows_with_models_and_grids_go_on_to_a_surface(tmp_path):
     assert (out / "b" / "dsm.tif").exists()
 
 
-def test_surface_command__refuses_an_image_that_its_points_would_replace(tmp_path):
-    write_pair(tmp_path, make_scene(60, 80, seed=4))
-    files, points = cameras(tmp_path, 60, 80), tmp_path / "out" / "points.tif"
-    points.parent.mkdir()
-    shutil.copy(tmp_path / "left.tif", points)
-    images = points, tmp_path / "right.tif"
-    result = invoke("surface", *images, tmp_path / "out", *sensor_words(files), "--disparity", 0, 9, "--resolution", 1)
-    assert (result.exit_code, "points.tif would be written" in result.stderr) == (2, True)
-    assert [file.name for file in points.parent.iterdir()] == ["points.tif"]
-
-
 def test_batch_command__refuses_an_input_that_the_surface_of_another_pair_would_replace(tmp_path):
     scene = make_scene(60, 80, seed=4)
     write_pair(tmp_path, scene)
     sensors = ",".join(file.name for file in cameras(tmp_path, 60, 80))
     columns = "name,left,right,minimum,maximum,left_model,right_model,left_grid,right_grid,resolution"
     (tmp_path / "out" / "a").mkdir(parents=True)
-    points = shutil.copy(tmp_path / "left.tif", tmp_path / "out" / "a" / "points.tif")
-    rows = f"a,left.tif,right.tif,0,9,{sensors},1", "b,out/a/points.tif,right.tif,0,9,,,,,"
+    image = shutil.copy(tmp_path / "left.tif", tmp_path / "out" / "a" / "dsm.tif")
+    rows = f"a,left.tif,right.tif,0,9,{sensors},1", "b,out/a/dsm.tif,right.tif,0,9,,,,,"
     (tmp_path / "pairs.csv").write_text("\n".join([columns, *rows]) + "\n")
-    before = points.read_bytes()
+    before = image.read_bytes()
     result = invoke("batch", tmp_path / "pairs.csv", tmp_path / "out")
-    assert (result.exit_code, "points.tif would be written" in result.stderr) == (2, True)
-    assert points.read_bytes() == before
+    assert (result.exit_code, "dsm.tif would be written" in result.stderr) == (2, True)
+    assert image.read_bytes() == before
+
+
+def test_dsm_command__remembers_models_and_grids_in_the_folder(level_run, tmp_path):
+    out, files = level_run
+    plain = invoke("dsm", out, "--resolution", 1)
+    assert (plain.exit_code, plain.stderr.count("\n")) == (2, 1)
+    assert f"{out} has no sensor models and grids yet: give --left-model, --right-model" in plain.stderr
+    assert invoke("dsm", out, "--resolution", 1, *sensor_words(files)).exit_code == 0
+    expected = read(out / "dsm.tif")
+    assert invoke("dsm", out, "--resolution", 1).exit_code == 0
+    np.testing.assert_array_equal(read(out / "dsm.tif"), expected)
+    assert invoke("triangulate", out).exit_code == 0
+    grid(files[3], 40, 50, offset=0.75)
+    changed = invoke("dsm", out, "--resolution", 1)
+    assert (changed.exit_code, f"{files[3]} has changed since" in changed.stderr) == (2, True)
+    assert invoke("dsm", out, "--resolution", 1, *sensor_words(files)).exit_code == 0
+    report = json.loads((out / "run.json").read_text())
+    report["inputs"]["left"]["sha256"] = 64 * "0"
+    (out / "run.json").write_text(json.dumps(report))
+    other = invoke("dsm", out, "--resolution", 1)
+    assert (other.exit_code, "geometry.json is of other images" in other.stderr) == (2, True)
+
+
+def test_dsm_command__of_two_runs_takes_the_models_and_grids_of_each(level_run, tmp_path):
+    out, files = level_run
+    (tmp_path / "b").mkdir()
+    other = shutil.copytree(out, tmp_path / "b" / "out")
+    report = (other / "run.json").read_text()
+    (other / "run.json").write_text(report.replace(FINISHED, "2026-11-22T12:00:00+00:00"))
+    swapped = [files[1], files[0], files[3], files[2]]  # heights then fall with the disparity
+    words = [*sensor_words(files), *sensor_words(swapped)]
+    result = invoke("dsm", out, other, "--resolution", 1, *words)
+    assert result.exit_code == 0, result.stderr
+    for folder, height in ((out, DATUM + 1), (other, DATUM - 1)):
+        assert invoke("dsm", folder, "--resolution", 1, "--output", tmp_path / "one.tif", "--overwrite").exit_code == 0
+        assert abs(np.nanmedian(read(tmp_path / "one.tif")[0]) - height) < 0.01
+
+
+@pytest.mark.peer("laspy")
+@pytest.mark.parametrize("name", ["points.laz", "points.las"])
+def test_triangulate_command__writes_a_point_cloud(matched_scene, tmp_path, name):
+    import laspy
+
+    scene, out = matched_scene
+    result = invoke("triangulate", out, "--output", tmp_path / name)
+    assert result.exit_code == 0, result.stderr
+    bands = read(out / "points.tif")
+    cloud = laspy.read(tmp_path / name)
+    known = np.isfinite(bands[0])
+    assert cloud.header.parse_crs().to_epsg() == 32631
+    assert len(cloud.points) == known.sum()
+    x, y = Transformer.from_crs(4326, 32631, always_xy=True).transform(*bands[:2, known])
+    expected = np.stack([x, y, *bands[[2, 3, 4]][:, known]])
+    found = np.stack([cloud.x, cloud.y, cloud.z, cloud["lower"], cloud["upper"]])
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-3, equal_nan=True)
+    np.testing.assert_array_equal(cloud.intensity, scene.left[known])
+    np.testing.assert_array_equal(cloud["confidence"], read(out / "intervals.tif")[3][known])
+    again = invoke("triangulate", out, "--output", tmp_path / name)
+    assert (again.exit_code, f"{name} exists: choose another name or --overwrite" in again.stderr) == (2, True)
 
 
 def test_surface_command__warns_of_models_that_nearly_fit(tmp_path):
@@ -437,8 +514,8 @@ def test_surface_command__warns_of_models_that_nearly_fit(tmp_path):
     command = "surface", *images, tmp_path / "out", *sensor_words(files), *search, "--resolution", 1
     result = invoke(*command)
     assert result.exit_code == 0, result.stderr
-    assert "m above the ellipsoid, lines of sight at most" in result.stdout
-    assert "warning: lines of sight miss each other by 0." in result.stderr
+    assert "m in the median (so models and grids fit together" in result.stdout
+    assert f"warning: {tmp_path / 'out'}: lines of sight miss each other by 0." in result.stderr
     assert "--strict is given" in invoke(*command, "--strict").stderr
 
 
@@ -448,7 +525,7 @@ def test_triangulate_command__warns_of_grids_that_reach_far_beyond_the_image(tmp
     assert (result.exit_code, result.stderr) == (0, "")
     result = invoke("triangulate", out, *sensor_words(cameras(tmp_path, 60, 140)))  # nodes -40, -20, ... 180
     assert result.exit_code == 0
-    assert "warning: the left grid reaches 101 px beyond the left image, more than 4 of its nodes" in result.stderr
+    assert f"warning: {out}: the left grid reaches 101 px beyond the left image, more than 4 of its" in result.stderr
 
 
 def test_batch_command__a_bad_model_fails_its_pair_only(tmp_path):
@@ -467,11 +544,11 @@ def test_batch_command__a_bad_model_fails_its_pair_only(tmp_path):
     assert result.exit_code == 1
     assert result.stderr.startswith(f"bad: there will be no surface: {tmp_path / 'no.tif'}: no such file")
     assert "1 of 3 pairs failed" in result.stderr
-    assert "\nnear: warning: lines of sight miss each other by 0." in result.stderr
-    assert "good: warning" not in result.stderr
+    assert f"warning: {tmp_path / 'out' / 'near'}: lines of sight miss each other by 0." in result.stderr
+    assert f"warning: {tmp_path / 'out' / 'good'}" not in result.stderr
     report = json.loads((tmp_path / "out" / "batch.json").read_text())
     assert [end["state"] for end in report.values()] == ["done", "done", "failed"]
     assert report["bad"]["counts"] == report["good"]["counts"]
     assert "no.tif: no such file" in report["bad"]["error"]
-    assert report["good"]["points"]["points"] > 0
+    assert report["good"]["surface"]["points"] > 0
     assert (tmp_path / "out" / "near" / "dsm.tif").exists()

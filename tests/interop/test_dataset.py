@@ -4,7 +4,7 @@ import dask.array
 import numpy as np
 import pytest
 import xarray as xr
-from finished import FINISHED, PLACE, random_bands, write_points, write_run
+from finished import PLACE, random_bands, write_run
 from numpy.testing import assert_allclose, assert_array_equal
 
 import sat_intervals
@@ -40,17 +40,6 @@ def test_open__without_chunks_reads_when_indexed(made):
     assert_array_equal(dataset["upper"][10:2:-2, 7:7], bands[2][10:2:-2, 7:7])
     assert_array_equal(dataset["upper"][10:2:-2, 7], bands[2][10:2:-2, 7])
     assert_array_equal(dataset["upper"].isel(x=[5, 2, 80]), bands[2][:, [5, 2, 80]])
-
-
-def test_open__has_the_points_of_the_run_only(tmp_path, caplog):
-    bands, validity, _ = random_bands(7, 9)
-    out = write_run(tmp_path, bands, validity)
-    write_points(out, heights := np.arange(63.0).reshape(7, 9))
-    assert_array_equal(sat_intervals.open(out)["height"], heights)
-    report = (out / "run.json").read_text()
-    (out / "run.json").write_text(report.replace(FINISHED, "2026-11-22T12:00:00+00:00"))
-    assert "height" not in sat_intervals.open(out)
-    assert "points.tif is of another run or of earlier points and is left out" in caplog.text
 
 
 @pytest.mark.peer("rioxarray", "odc.geo")

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from sat_intervals.kernels.splat import BOUNDED, empty_cells, mean_heights, medians, splat
+from sat_intervals.kernels.splat import BOUNDED, empty_cells, gather, mean_heights, medians, splat
 
 
 @settings(max_examples=60)
@@ -21,9 +21,13 @@ def test_splat__and_medians_equal_their_slow_twins(seed, rows, columns, radius):
     bounded = np.isfinite(lower)
     cells = empty_cells(rows, columns)
     splat(column, row, height, lower, upper, confidence, radius, cells)
-    bounds = [
-        medians(column[bounded], row[bounded], bound[bounded], radius, cells[BOUNDED]) for bound in (lower, upper)
-    ]
+    with_heights, counts = np.flatnonzero(bounded & ~np.isnan(height)), cells[BOUNDED].astype(np.int64)
+    bounds = []
+    for bound in (lower, upper):
+        listed, ends = np.empty(counts.sum()), counts.cumsum().reshape(counts.shape) - counts
+        for part in np.array_split(with_heights, 2):
+            gather(column[part], row[part], bound[part], radius, ends, listed)
+        bounds.append(medians(counts, listed))
     for i, j in np.ndindex(rows, columns):
         across, down = column - (j + 0.5), row - (i + 0.5)
         falls_in = np.maximum(abs(across), abs(down)) <= 0.5

@@ -13,7 +13,7 @@ from rasterio.errors import NotGeoreferencedWarning
 from rio_cogeo.cogeo import cog_validate
 
 from sat_intervals.products import Band
-from sat_intervals.raster import POINT_FILES, RUN_FILES, File, Georeferencing, blocks, cog, north_up, run_files
+from sat_intervals.raster import RUN_FILES, File, Georeferencing, blocks, cog, north_up, points_file, run_files
 from sat_intervals.raster.blocks import BLOCK, codec_versions, compressed, factors
 from sat_intervals.raster.cog import Part, assemble, template
 from sat_intervals.raster.streaming import Stream
@@ -68,7 +68,7 @@ def assert_valid(path: Path) -> None:
         (VALIDITY, (512, 512), False),
         (VALIDITY, (1100, 40), True),
         (COUNTS, (3, 1100), False),
-        (*POINT_FILES, (20, 513), False),
+        (points_file("points.tif"), (20, 513), False),
     ],
 )
 def test_assemble__is_a_valid_file_with_every_level(tmp_path, monkeypatch, file, shape, is_big):

@@ -27,7 +27,6 @@ from rasterio.transform import Affine
 from sat_intervals.errors import InputError
 from sat_intervals.products import BANDS, FLAGS, INVALID, MASKED, NO_DATA
 from sat_intervals.raster import (
-    POINT_FILES,
     RUN_FILES,
     File,
     Georeferencing,
@@ -38,6 +37,7 @@ from sat_intervals.raster import (
     files_of,
     gdal,
     open_image,
+    points_file,
     read_window,
     surface_file,
 )
@@ -558,8 +558,9 @@ def test_output_writer__writes_what_it_is_given(tmp_path, products, rows):
 
 
 def test_output_writer__writes_large_numbers_of_many_bands(tmp_path):
-    points = np.random.default_rng(0).uniform(-180, 9000, (len(POINT_FILES[0].bands), 300, 530))
-    with OutputWriter(tmp_path, POINT_FILES, 300, 530, Georeferencing(), {}) as output:
+    file = points_file("points.tif")
+    points = np.random.default_rng(0).uniform(-180, 9000, (len(file.bands), 300, 530))
+    with OutputWriter(tmp_path, [file], 300, 530, Georeferencing(), {}) as output:
         for row in range(0, 300, 130):
             output.write(row, points[:, row : row + 130])
         output.publish()

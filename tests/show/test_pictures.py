@@ -303,7 +303,7 @@ def test_plot__draws_no_surface_of_an_earlier_run_and_none_that_is_no_surface(tm
     write_surface(out, np.ones((20, 20)), runs="earlier")
     done = invoke("plot", out, "--dpi", "40")
     assert done.exit_code == 0, done.output
-    said = f"{out / 'dsm.tif'} is of another run or of earlier points and is left out: rerun sat-intervals dsm\n"
+    said = f"{out / 'dsm.tif'} is of another run and is left out: rerun sat-intervals dsm\n"
     assert done.stderr == f"sat-intervals: {said}"
     assert not (out / "dsm.png").exists()
     shutil.copy(out / "validity.tif", tmp_path / "dsm.tif")

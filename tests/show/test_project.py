@@ -128,7 +128,7 @@ def test_write_project__leaves_out_what_is_missing_or_of_another_run(run):
     (out.parent / "right.tif").unlink()
     done = invoke("project", out)
     assert done.exit_code == 0
-    assert "dsm.tif is of another run or of earlier points and is left out: rerun sat-intervals dsm" in done.stderr
+    assert "dsm.tif is of another run and is left out: rerun sat-intervals dsm" in done.stderr
     assert "the right image is left out: " in done.stderr
     names = [name for _, name, _ in layers_of(read_project(out))]
     assert names == ["validity", "confidence", "interval width", "disparity", "truth", "left"]
