@@ -166,6 +166,9 @@ _FIRST_SETTINGS = (
     ),
 )
 _LAST_SETTINGS = (
+    click.option(
+        "--rows", type=click.Choice(("auto", "none")), help="Row offsets of the right image: taken out, or left."
+    ),
     click.option("--tile-size", type=int, help="Side of a tile's core in pixels, a multiple of 64."),
     click.option("--workers", type=click.IntRange(min=1), help="Tiles at once; default one per core."),
     click.option(
@@ -180,6 +183,7 @@ _LAST_SETTINGS = (
 
 # Dotted names of the options that are settings as they stand.
 _PLACES = {
+    "rows": "rows",
     "coverage": "interval.coverage",
     "calibration": "interval.calibration",
     "alpha": "interval.alpha",

@@ -30,8 +30,9 @@ def search_range(pair: PairArguments, output: Path | None, overwrite: bool, as_j
     from sat_intervals.raster.identity import check_not_replaced
     from sat_intervals.raster.publishing import check_free
     from sat_intervals.run.local_ranges import write_ranges
-    from sat_intervals.run.quality import doubts
-    from sat_intervals.run.search_range import find_here
+    from sat_intervals.run.quality import doubts_of, rows_left
+    from sat_intervals.run.search_range import finder_here
+    from sat_intervals.tiling import Window
 
     with Console(quiet or as_json) as console:
         left, right = pair.open()
@@ -39,15 +40,18 @@ def search_range(pair: PairArguments, output: Path | None, overwrite: bool, as_j
             names = pair.files
             check_not_replaced([file for name in names for file in (name, *files_of(name))], [output])
             check_free(output, overwrite=overwrite)
-        found = find_here(left, right, console.progress)
+        with finder_here(console.progress) as finder:
+            found = finder.search_range(left, right)
+            whole = Window(0, 0, left.height, left.width)
+            survey = finder.survey(left, right, whole, (found.minimum, found.maximum))
         if output:
             write_ranges(output, found.local, left)
     if as_json:
-        say_json(found.report())
+        say_json(found.report() | {"survey": survey.report()})
         return
-    for name, value in _rows(found):
+    for name, value in [*_rows(found), *_survey(survey)]:
         click.echo(f"{name:<36}{value}")
-    for line in doubts(found.quality, dict(zip(("left", "right"), pair.images, strict=True))):
+    for line in [*doubts_of(found.collars, survey, pair.images), *rows_left(survey, "auto", pair.images[1])]:
         click.echo(line)
 
 
@@ -59,13 +63,21 @@ def _rows(found: Any) -> list[tuple[str, str]]:
         searched = f"{level.minimum} to {level.maximum} px searched, {100 * level.matched:.1f} % matched"
         rows.append((f"  images reduced by {level.step}", searched))
     rows += _histogram(found.histogram)
-    quality: dict[str, Any] = found.quality
-    if quality["noise"] is not None:
-        rows.append(("distance of matches", f"{quality['noise']:.2f} of that of random pixels"))
-        rows.append(("rows of the two images differ by", f"{abs(quality['row_offset']):.1f} px"))
-    for side, collar in quality["collars"].items():
+    for side, collar in found.collars.items():
         share = f"{100 * collar['share']:.0f} % of the pixels, along the borders"
         rows.append((f"{side} image, value {collar['value']:g}", share))
+    return rows
+
+
+def _survey(survey: Any) -> list[tuple[str, str]]:
+    rows = []
+    if survey.noise is not None:
+        rows.append(("distance of matches", f"{survey.noise:.2f} of that of random pixels"))
+    if found := survey.rows:
+        for name, (median, most) in (("the two images", found.before), ("a smooth function", found.after)):
+            rows.append((f"rows of {name} differ by", f"{median:.2f} px, 90 % at most {most:.2f} px"))
+        does = "is taken out by match" if survey.taken else "is left as it is"
+        rows.append(("  which", f"has up to {found.most:.2f} px, of {found.matches} matches, and {does}"))
     return rows
 
 

@@ -3,7 +3,7 @@
 import json
 import logging
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from pydantic import AliasPath, BaseModel, Field, ValidationError
 from sat_intervals.config import Config, Regularization, load_config
 from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.kernels.confidence import low_confidence
+from sat_intervals.kernels.rows import RowOffsets
 from sat_intervals.products import BANDS, Bands
 from sat_intervals.raster import Georeferencing, Image, check_not_replaced, open_image, read_layers, read_tags
 from sat_intervals.raster.images import opened
@@ -62,6 +63,11 @@ class Run:
     def left_georeferencing(self) -> Georeferencing:
         """Return the georeferencing of the whole left image."""
         return self.georeferencing.shifted(Window(-self.region.row, -self.region.column, *self.shape))
+
+    @property
+    def rows(self) -> RowOffsets | None:
+        """Return the row offsets that were taken out of the right image."""
+        return RowOffsets.of_report(self.report["rows"]) if self.report.get("rows") else None
 
     @property
     def truth_beside(self) -> Path:
@@ -200,6 +206,7 @@ def open_results(out: str | Path, truth: str | Path | None = None) -> Results:
     """Open a finished run, its images and its truth, by default ``truth.tif`` beside the left image if it exists."""
     run = open_run(out)
     left, right = (open_input(run.report["inputs"][side]) for side in ("left", "right"))
+    right = replace(right, rows=run.rows)
     truth = truth or (run.truth_beside if run.truth_beside.exists() else None)
     return Results(**vars(run), left=left, right=right, truth=None if truth is None else run.layer(truth))
 

@@ -89,7 +89,7 @@ def geometry_of(run: Run) -> Geometry:
 def _sensors(run: Run, paths: Sequence[Path]) -> "tuple[Sensors, dict[str, float]]":
     from sat_intervals.heights.sensors import Sensors, check_cover, median_residual  # needs the extra `dsm`
 
-    sensors = Sensors.load(*paths, left=run.left_georeferencing)
+    sensors = Sensors.load(*paths, left=run.left_georeferencing, rows=run.rows)
     search = run.config.disparity.minimum, run.config.disparity.maximum
     check_cover(sensors, run.region, run.report["inputs"]["right"]["width"], *search)
     return sensors, {

@@ -110,7 +110,8 @@ class _Work:
         row, column, disparity = (axis.ravel() for axis in np.meshgrid(rows, columns, self._search, indexing="ij"))
         ground = sensors.triangulate(row, column, disparity)
         seen = self._location.positions(*ground[:, :3].T)
-        misfit = np.abs(seen[:, 2] - seen[:, 0])[np.isfinite(seen).all(axis=1)]
+        lower = run.rows.at(row, seen[:, 3]) if run.rows else 0.0
+        misfit = np.abs(seen[:, 2] - seen[:, 0] - lower)[np.isfinite(seen).all(axis=1)]
         self.row_misfit = (float(np.median(misfit)), float(misfit.max())) if misfit.size else None
         self._ground = ground[np.isfinite(ground).all(axis=1), :3]
         if not len(self._ground):

@@ -12,6 +12,7 @@ import numpy as np
 from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.heights.lattice import Lattice
 from sat_intervals.kernels.compiled import kernels_of_others
+from sat_intervals.kernels.rows import RowOffsets
 from sat_intervals.raster import GROUND, Georeferencing
 from sat_intervals.tiling import Window
 
@@ -43,6 +44,7 @@ class Sensors:
     right_model: Any
     left_grid: RectificationGrid
     right_grid: RectificationGrid
+    rows: RowOffsets | None = None  # by which matched right rows are lower than those of the right grid
 
     @classmethod
     def load(
@@ -53,20 +55,22 @@ class Sensors:
         right_grid: Path,
         *,
         left: Georeferencing | None = None,
+        rows: RowOffsets | None = None,
     ) -> "Sensors":
         """Read RPC models (GeoTIFF tags, ``.geom``, DIMAP XML) and epipolar grids, see `grids.read_grid`."""
-        models = (_read(path, "RPC model", GeoModel) for path in (left_model, right_model))
-        read = partial(read_grid, left=left or Georeferencing())
-        grids = (_read(path, "epipolar grid", read) for path in (left_grid, right_grid))
-        return cls(*models, *grids)
+        model = partial(_read, kind="RPC model", reader=GeoModel)
+        grid = partial(_read, kind="epipolar grid", reader=partial(read_grid, left=left or Georeferencing()))
+        return cls(model(left_model), model(right_model), grid(left_grid), grid(right_grid), rows)
 
     def triangulate(self, row: np.ndarray, column: np.ndarray, disparity: np.ndarray) -> np.ndarray:
         """Return ``(n, 4)`` longitude, latitude, height and residual of epipolar positions ``(n,)``.
 
         Degrees (WGS 84), metres above its ellipsoid, and metres from the point to either line of sight. Pixel centres
-        are integers; the right pixel is at ``column + disparity`` of the same row.
+        are integers; the right pixel is at ``column + disparity`` of the same row, or of the one that was matched.
         """
-        matches = np.column_stack([column, row, column + disparity, row]).astype(np.float64)
+        right = column + disparity
+        lower = self.rows.at(row, right) if self.rows else 0.0
+        matches = np.column_stack([column, row, right, row + lower]).astype(np.float64)
         found = [self._triangulate(matches[first : first + _AT_ONCE]) for first in range(0, len(matches), _AT_ONCE)]
         return np.concatenate(found)
 

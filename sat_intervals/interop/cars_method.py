@@ -71,7 +71,7 @@ class SatIntervals(PandoraMethod, short_name=["sat_intervals"]):  # type: ignore
                 "dense_matching.settings: leave out disparity, and null for interval or ambiguity: CARS provides the "
                 "search range and needs intervals and ambiguity"
             )
-        given = {"preset": "paper", **settings, "disparity": {"minimum": minimum, "maximum": maximum}}
+        given = {"preset": "paper", "rows": "none", **settings, "disparity": {"minimum": minimum, "maximum": maximum}}
         config = load_config(given)
         if config.interval is not None and config.interval.coverage is None:
             ambiguity = {"normalization": "range", **given.get("ambiguity", {})}

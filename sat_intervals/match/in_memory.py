@@ -9,11 +9,15 @@ import xarray as xr
 
 from sat_intervals.config import Config, load_config, resolved, unreached
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.kernels.rows import shift_rows
 from sat_intervals.match.memory import check_memory, volume_bytes
 from sat_intervals.match.normalization import Moments, PairStatistics, blocks, moments, statistics_of
+from sat_intervals.match.rows import surveyed
+from sat_intervals.match.sampling import look, spots
 from sat_intervals.match.search_range import Found, NoRangeError, find_range, finest_step, reduced, with_range
-from sat_intervals.match.whole import match_whole
+from sat_intervals.match.whole import cut, match_whole, whole_view
 from sat_intervals.products import BANDS, flag_attributes
+from sat_intervals.tiling import Window
 
 _LOG = logging.getLogger(__name__)
 
@@ -58,6 +62,8 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
             ranges = found.local.clipped(config.disparity.minimum, config.disparity.maximum)
     _check_fit(*pixels, config)
     images = _image(pixels[0]), _image(pixels[1])
+    if config.rows == "auto":
+        images = images[0], _with_rows(*images, config)
     statistics = None
     if config.cost.needs_statistics:
         statistics = PairStatistics(*(statistics_of(_moments(image)) for image in images))
@@ -104,6 +110,20 @@ def _found(left: np.ma.MaskedArray, right: np.ma.MaskedArray) -> Found:
         raise NoRangeError(
             f"the arrays have no common search range: {error}: give disparity minimum and maximum"
         ) from None
+
+
+def _with_rows(left: np.ma.MaskedArray, right: np.ma.MaskedArray, config: Config) -> np.ma.MaskedArray:
+    """Return the right image at the rows of the left one; itself if they correspond."""
+    views = whole_view(left), whole_view(right)
+    chosen = spots(Window(0, 0, *left.shape), config.disparity.minimum, config.disparity.maximum)
+    found = (look(spot, *map(cut, views, spot.views)) for spot in chosen)
+    rows = surveyed([one for one in found if one], *right.shape).taken
+    if rows is None:
+        return right
+    first, count, offset = rows.read(0, 0, *right.shape)
+    wider = cut(views[1], Window(first, 0, count, right.shape[1]))
+    pixels, state = shift_rows(wider.pixels, wider.state, offset)
+    return np.ma.array(pixels, mask=state != 0)
 
 
 def _check_rows(left: np.ndarray, right: np.ndarray) -> None:

@@ -1,146 +1,216 @@
-"""How noisy a pair is, and how far its rows differ: matches of sample windows at full resolution.
+"""Look at blocks spread over a pair at full resolution: how noisy it is, and how far its rows differ.
 
 Letters: r row, c column.
 """
 
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from sat_intervals.kernels.cost import Codes, census
+from sat_intervals.kernels.rows import shift_equations
 from sat_intervals.match.search_range import Matches, Step, match_level, reduced, settings
 from sat_intervals.match.whole import cut, match_whole
-from sat_intervals.tiling import View, Views, Window, facing
+from sat_intervals.tiling import View, Window, facing
 
-# Side of a window in pixels of the image, and windows along each side of the image; side in pixels of the part of a
-# level that determines the row offset.
-_SIDE, _WINDOWS, _PART = 64, 2, 128
-# Rows up and down that are tried, and the box over which costs are summed.
-ROWS, _BOX = 2, 9
-# Side of the middle of a tile that is looked at, what it is reduced by first, and pixels of a surface there.
-_MIDDLE, _STEP, _SPECKLE = 192, Step(4, 4), 40
-# Matches of a window that are needed at least.
-_FEWEST = 200
+# Side of a block, and blocks along each side of the image at most; side of its part that is matched at full resolution.
+_SIDE, _BLOCKS, _PART = 256, 5, 96
+# What a block is reduced by first, the pixels of a surface there, and the rows of the image that are read around it.
+_STEP, _SPECKLE, _MARGIN = Step(4, 4), 40, 20
+# Rows up and down that are tried at a level, and the box over which costs are summed.
+_ROWS, _BOX = 2, 9
+# Matches of a level and of a part that are needed at least.
+_FEWEST_COARSE, _FEWEST = 100, 500
 _CENSUS, _BITS = 5, 24
 # Distance of the random candidates that a match is compared with, in columns.
 _AWAY = 16
+# Least-squares windows: pixels between centres, from the centre to the sides, and the share that must be matched.
+_BETWEEN, _RADIUS, _MATCHED = 4, 4, 0.5
+# Gain of a likely window, the largest shift that is believed, shifts that are enough, and steps.
+_LIKELY, _FARTHEST, _ENOUGH, _STEPS = 0.2, 1.5, 30, 3
 
 
-class Sample(NamedTuple):
-    """A window to look at.
-
-    left: window of the left image.
-    minimum, maximum: disparities to search there.
-    rows: rows by which the right window lies lower, rounded from the row offset of the coarse matches.
-    """
+class Spot(NamedTuple):
+    """A block of the left image to look at, and the disparities to search there."""
 
     left: Window
     minimum: int
     maximum: int
-    rows: int
 
     @property
     def views(self) -> tuple[Window, Window]:
-        """Windows of both images that `look` needs."""
-        margin = _CENSUS // 2
-        right = Window(self.left.row + self.rows, self.left.column + self.minimum, *self._shape).grown(ROWS, 0)
-        return self.left.grown(margin, margin), right.grown(margin, margin)
-
-    @property
-    def _shape(self) -> tuple[int, int]:
-        return self.left.height, self.left.width + self.maximum - self.minimum
+        """Return the windows of both images that `look` needs."""
+        return self.left, facing(self.left, self.minimum, self.maximum).grown(_MARGIN, 0)
 
 
 class Look(NamedTuple):
-    """Figures of a window: number of matches, their mean distance, that of random candidates, and the row offset."""
+    """Figures of a block.
 
+    row, column: middle of the part that was matched, in the right image.
+    number: matches there.
+    matched, random: mean distances of their codes, and of those of random candidates.
+    rows: median of the rows by which the right image lies lower, in pixels.
+    """
+
+    row: float
+    column: float
     number: int
     matched: float
     random: float
     rows: float
 
 
-def samples(matches: Matches, rows: float) -> list[Sample]:
-    """Windows spread over the image, where enough is matched; ``rows`` is the row offset of the coarse matches."""
-    step = matches.step
-    height, width = max(1, _SIDE // step.rows), max(1, _SIDE // step.columns)
-    shares = _shares(matches.kept, height, width)
-    found = []
-    for part in _parts(shares.shape):
-        there = shares[part.slices]
-        usual = np.median(there[there > 0.5]) if (there > 0.5).any() else 1.0  # not the easiest windows of all
-        place = np.unravel_index(np.argmin(np.abs(there - usual)), there.shape)
-        r, c = (part.row + int(place[0])) * height, (part.column + int(place[1])) * width
-        here = np.s_[r : r + height, c : c + width]
-        values = matches.disparity[here][matches.kept[here]] * step.columns
-        if values.size * 2 > height * width:
-            low, high = np.quantile(values, [0.02, 0.98])
-            window = Window(r * step.rows, c * step.columns, height * step.rows, width * step.columns)
-            more = 2 * step.columns + 2
-            found.append(Sample(window, int(low) - more, int(high) + more, round(rows)))
-    return found
+def spots(region: Window, minimum: int, maximum: int) -> list[Spot]:
+    """Return blocks spread over a region of the left image, to be searched over a range of disparities."""
+    rows, columns = _starts(region.row, region.height), _starts(region.column, region.width)
+    blocks = (Window(row, column, _SIDE, _SIDE).clipped(region) for row in rows for column in columns)
+    return [Spot(block, minimum, maximum) for block in blocks]
 
 
-def _shares(kept: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Share of kept pixels in each block of ``height x width`` pixels."""
-    rows, columns = kept.shape[0] // height, kept.shape[1] // width
-    inner = kept[: rows * height, : columns * width]
-    return np.asarray(inner.reshape(rows, height, columns, width).mean(axis=(1, 3)))
+def _starts(first: int, size: int) -> list[int]:
+    """Return where blocks begin along a side of a region; they share at most half of their pixels."""
+    number = min(_BLOCKS, max(1, 2 * size // _SIDE - 1))
+    return [first + max(0, size - _SIDE) * i // max(1, number - 1) for i in range(number)]
 
 
-def _parts(number: tuple[int, int]) -> Iterable[Window]:
-    """Parts of a grid of windows, `_WINDOWS` along each side if it has so many."""
-    ends = [np.linspace(0, count, min(_WINDOWS, count) + 1).astype(int) for count in number]
-    for top, bottom in zip(ends[0], ends[0][1:], strict=False):
-        for first, last in zip(ends[1], ends[1][1:], strict=False):
-            yield Window(int(top), int(first), int(bottom - top), int(last - first))
+def look(spot: Spot, left: View, right: View) -> Look | None:
+    """Match a block coarsely, then a part of it at full resolution; None if too little is matched.
 
-
-def look(sample: Sample, left: tuple[np.ndarray, np.ndarray], right: tuple[np.ndarray, np.ndarray]) -> Look | None:
-    """Match a sample; ``left`` and ``right`` are pixels and states of its views. None if too little is matched."""
-    here, there = (np.ma.array(pixels, mask=state != 0) for pixels, state in (left, right))
-    margin = _CENSUS // 2
-    config = settings(0, sample.maximum - sample.minimum)
-    found = match_whole(here, there[ROWS:-ROWS], config)
-    inner = slice(margin, -margin), slice(margin, -margin)
-    known = (found.valid & (found.confidence > 0))[inner]
-    index = np.rint(np.nan_to_num(found.disparity[inner])).astype(int)
-    codes = census(*left, _CENSUS), census(*right, _CENSUS)
-    return _look(codes, index, known, sample.rows)
-
-
-def _look(codes: tuple[Codes, Codes], index: np.ndarray, known: np.ndarray, rows: int) -> Look | None:
-    """Figures of the matches of a window; ``rows`` is how much lower the right codes were read."""
-    offsets = row_offsets(*codes, index, known)
-    if known.sum() < _FEWEST or not offsets.size:
+    ``left`` and ``right`` are the views of the spot.
+    """
+    if (coarse := _coarse(left, right)) is None:
         return None
-    matched = _distances(*codes, index, ROWS)[known]
-    width = codes[1].state.shape[1]
+    matches, rows = coarse
+    part, first, last = _part(matches, spot.left)
+    here = cut(left, part)
+    for _ in range(3):
+        there = Window(part.row + rows, part.column + spot.minimum + first, part.height, part.width + last - first)
+        found = _fine(here, cut(right, there.grown(4, 4)), spot.minimum + first)
+        if found is None:
+            return None
+        figures, shift = found
+        if abs(shift) <= 0.5:  # of rows farther apart too little is matched well
+            break
+        rows += round(shift)
+    else:
+        return None
+    middle = figures.row + part.row + part.height / 2, figures.column + part.column + part.width / 2
+    return figures._replace(row=middle[0], column=middle[1], rows=rows + shift)
+
+
+def _coarse(left: View, right: View) -> tuple[Matches, int] | None:
+    """Return matches of a reduced block, and the rows of the image by which the right one lies lower there."""
+    here = reduced(left.pixels, left.state, _STEP)
+    rows = 0
+    for _ in range(2):
+        first = _MARGIN + rows
+        window = slice(first, first + left.window.height)
+        there = reduced(right.pixels[window], right.state[window], _STEP)
+        if 0 in here.shape or there.shape[1] < here.shape[1]:
+            return None
+        matches = match_level(here, there, (0, there.shape[1] - here.shape[1]), _SPECKLE)
+        if matches.kept.sum() < _FEWEST_COARSE:
+            return None
+        offsets = _coarse_offsets(here, there, matches)
+        if not offsets.size:
+            return None
+        more = float(np.median(offsets))
+        if abs(more) < 0.75:
+            return matches._replace(step=_STEP), rows + round(more * _STEP.rows)
+        rows = int(np.clip(rows + _STEP.rows * round(more), -_MARGIN + 4, _MARGIN - 4))
+    return matches._replace(step=_STEP), rows
+
+
+def _coarse_offsets(left: np.ndarray, right: np.ndarray, matches: Matches) -> np.ndarray:
+    """Return rows of a level by which the right image lies lower, of the matches that determine them."""
+    index = np.rint(matches.disparity).astype(int)
+    first, last = int(index[matches.kept].min()) - 1, int(index[matches.kept].max()) + 1
+    there = Window(0, first, left.shape[0], left.shape[1] + last - first)
+    margin, views = _CENSUS // 2, (_view(left), _view(right))
+    codes = (
+        census(*cut(views[0], views[0].window.grown(margin, margin))[1:], _CENSUS),
+        census(*cut(views[1], there.grown(margin + _ROWS, margin))[1:], _CENSUS),
+    )
+    return row_offsets(*codes, index - first, matches.kept)
+
+
+def _part(matches: Matches, block: Window) -> tuple[Window, int, int]:
+    """Return the part of a block where most is matched, and the range of its disparities from the first searched."""
+    side = min(_PART // _STEP.rows, *matches.kept.shape)
+    shares = np.lib.stride_tricks.sliding_window_view(matches.kept, (side, side)).mean(axis=(2, 3))
+    r, c = map(int, np.unravel_index(np.argmax(shares), shares.shape))
+    here = np.s_[r : r + side, c : c + side]
+    low, high = np.quantile(matches.disparity[here][matches.kept[here]] * _STEP.columns, [0.02, 0.98])
+    part = Window(block.row + r * _STEP.rows, block.column + c * _STEP.columns, side * _STEP.rows, side * _STEP.columns)
+    more = 2 * _STEP.columns
+    return part, int(low) - more, int(high) + more
+
+
+def _fine(left: View, right: View, minimum: int) -> tuple[Look, float] | None:
+    """Match a part and measure its rows; ``right`` is grown by 4 pixels. None if too little is matched.
+
+    The place of the figures is the median disparity.
+    """
+    inner = right.cropped(right.window.grown(-4, -4))
+    here, there = (np.ma.array(view.pixels, mask=view.state != 0) for view in (left, inner))
+    found = match_whole(here, there, settings(0, inner.window.width - left.window.width))
+    known = found.valid & (found.confidence > 0)
+    if known.sum() < _FEWEST:
+        return None
+    disparity = np.nan_to_num(found.disparity).astype(np.float64)
+    shift, margin = 0.0, _CENSUS // 2
+    for _ in range(_STEPS):
+        pixels = left.pixels.astype(np.float64), right.pixels.astype(np.float64)
+        shifts = _shifts(*shift_equations(*pixels, disparity, known, shift, _BETWEEN, _RADIUS))
+        if shifts.size < _ENOUGH:
+            return None
+        before, shift = shift, float(np.clip(shift + np.median(shifts), -_FARTHEST, _FARTHEST))
+        if abs(shift - before) < 0.01:
+            break
+    codes = census(left.pixels, left.state, _CENSUS), census(inner.pixels, inner.state, _CENSUS)
+    where = known[margin:-margin, margin:-margin]
+    index = np.rint(disparity).astype(int)[margin:-margin, margin:-margin]
+    matched = _distances(*codes, index, 0)[where].mean()
     column = np.arange(index.shape[1])
-    random = _distances(*codes, (index + _AWAY + column) % width - column, ROWS)[known]
-    return Look(int(known.sum()), float(matched.mean()), float(random.mean()), rows + float(np.median(offsets)))
+    random = _distances(*codes, (index + _AWAY + column) % codes[1].state.shape[1] - column, 0)[where].mean()
+    middle = float(np.median(disparity[known])) + minimum
+    return Look(0.0, middle, int(known.sum()), float(matched), float(random), 0.0), shift
+
+
+def _shifts(equations: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Return the likely row shifts of `shift_equations` in pixels."""
+    enough = pixels >= _MATCHED * (2 * _RADIUS + 1) ** 2
+    matrix, side = equations[enough, :, :4], equations[enough, :, 4:]
+    sizes = np.einsum("nii->ni", matrix) ** 0.5
+    sizes[sizes == 0] = 1
+    matrix, side = matrix / sizes[:, :, np.newaxis] / sizes[:, np.newaxis], side / sizes[:, :, np.newaxis]
+    solvable = np.linalg.det(matrix) > 1e-6
+    found = np.linalg.solve(matrix[solvable], side[solvable])[..., 0] / sizes[solvable]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shift = found[:, 3] / found[:, 0]
+    return np.asarray(shift[(found[:, 0] > _LIKELY) & (np.abs(shift) < _FARTHEST)])
 
 
 def row_offsets(left: Codes, right: Codes, index: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Rows by which the right image lies lower, one figure for each match that determines it.
 
-    left, right: codes; the right ones have `ROWS` rows more at both ends, and ``right[r + ROWS, c + k]`` faces
+    left, right: codes; the right ones have `_ROWS` rows more at both ends, and ``right[r + _ROWS, c + k]`` faces
         ``left[r, c]``.
     index: ``(rows, columns)`` integers: k of each match.
     known: bool of the same shape: the matches.
     """
     shifted = np.stack([index - 1, index, index + 1])[:, np.newaxis]
-    rows = np.arange(2 * ROWS + 1)[:, np.newaxis, np.newaxis]
+    rows = np.arange(2 * _ROWS + 1)[:, np.newaxis, np.newaxis]
     stack = _boxed(_distances(left, right, shifted, rows), known).min(axis=0)
     best = np.argmin(stack, axis=0)
     told = known & np.isfinite(stack[0]) & (stack.min(axis=0) < np.median(stack, axis=0))
-    at = np.clip(best, 1, 2 * ROWS - 1)[np.newaxis]
+    at = np.clip(best, 1, 2 * _ROWS - 1)[np.newaxis]
     before, here, after = (np.take_along_axis(stack, at + step, axis=0)[0] for step in (-1, 0, 1))
     with np.errstate(invalid="ignore", divide="ignore"):
         shift = (before - after) / (2 * (np.maximum(before, after) - here))  # as V-fit
-    inner = (best > 0) & (best < 2 * ROWS)
-    return np.asarray((best - ROWS + np.where(inner, np.nan_to_num(shift), 0))[told])
+    inner = (best > 0) & (best < 2 * _ROWS)
+    return np.asarray((best - _ROWS + np.where(inner, np.nan_to_num(shift), 0))[told])
 
 
 def _distances(left: Codes, right: Codes, index: np.ndarray, rows: np.ndarray | int) -> np.ndarray:
@@ -171,67 +241,16 @@ def _boxed(costs: np.ndarray, known: np.ndarray) -> np.ndarray:
         return np.asarray(sums(np.where(known, costs, 0)) / sums(known))
 
 
-def coarse_rows(left: np.ndarray, right: np.ndarray, matches: Matches) -> float:
-    """Rows of the image by which the right image is lower, from a part of a level; 0 if its matches do not show it."""
-    height, width = (min(_PART, side) for side in left.shape)
-    shares = _shares(matches.kept, height, width)
-    place = np.unravel_index(np.argmax(shares), shares.shape)
-    part = Window(int(place[0]) * height, int(place[1]) * width, height, width)
-    index = np.rint(matches.disparity[part.slices]).astype(int)
-    known = matches.kept[part.slices]
-    if not known.any():
-        return 0.0
-    first, last = int(index[known].min()) - 1, int(index[known].max()) + 1
-    margin, facing = _CENSUS // 2, Window(part.row, part.column + first, height, width + last - first)
-    codes = (
-        census(*_cut(_view(left), part.grown(margin, margin)), _CENSUS),
-        census(*_cut(_view(right), facing.grown(margin + ROWS, margin)), _CENSUS),
-    )
-    offsets = row_offsets(*codes, index - first, known)
-    return float(np.median(offsets)) * matches.step.rows if offsets.size else 0.0
-
-
-def _cut(view: View, window: Window) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels and states of a window, which may leave the view."""
-    return cut(view, window)[1:]
-
-
 def _view(image: np.ndarray) -> View:
     """View of an image with NaN where not usable."""
     return View(Window(0, 0, *image.shape), np.nan_to_num(image), np.isnan(image).view(np.uint8))
 
 
-def look_in_tile(views: Views, core: Window, minimum: int, maximum: int) -> list[Look]:
-    """Estimate noise and row offset of the pair from the middle of a tile, ``core``, over a search range."""
-    row, column = (max(0, (side - _MIDDLE) // 2) for side in (core.height, core.width))
-    middle = Window(core.row + row, core.column + column, *(min(_MIDDLE, side) for side in (core.height, core.width)))
-    there = facing(middle, minimum, maximum)
-    left, right = (reduced(*_cut(view, window), _STEP) for view, window in zip(views, (middle, there), strict=True))
-    if 0 in left.shape:
-        return []
-    matches = match_level(left, right, (0, (maximum - minimum) // _STEP.columns), _SPECKLE)._replace(step=_STEP)
-    looks = []
-    for sample in samples(matches, coarse_rows(left, right, matches)):
-        windows = [
-            Window(middle.row + one.row, first + one.column, one.height, one.width)
-            for one, first in zip(sample.views, (middle.column, there.column), strict=True)
-        ]
-        looks.append(look(sample, *(_cut(view, window) for view, window in zip(views, windows, strict=True))))
-    return [found for found in looks if found is not None]
-
-
-def summary(looks: Iterable[Look | None]) -> dict[str, Any]:
-    """Noise and row offset of a pair from its samples; None if no window determines them.
-
-    ``noise`` is the mean distance of matches over that of random candidates; ``row_offset`` has the median size of the
-    windows' offsets in rows, positive where the right image lies lower.
-    """
-    told = [found for found in looks if found is not None]
-    if not told:
-        return {"noise": None, "row_offset": None}
+def noise_of(looks: Iterable[Look]) -> float | None:
+    """Return the mean distance of matches over that of random candidates; None without looks."""
+    if not (told := list(looks)):
+        return None
     weights = np.array([found.number for found in told], float)
     matched = np.average([found.matched for found in told], weights=weights)
     random = np.average([found.random for found in told], weights=weights)
-    size = np.median([abs(found.rows) for found in told])
-    sign = np.sign(np.median([found.rows for found in told])) or 1.0
-    return {"noise": round(float(matched / random), 3), "row_offset": round(float(sign * size), 2)}
+    return round(float(matched / random), 3)

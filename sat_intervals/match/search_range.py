@@ -73,8 +73,7 @@ class Found:
     matched: share of the usable left pixels with a consistent match at the finest level.
     levels: from coarse to fine.
     histogram: matches of the finest level between the first and the last disparity: ``edges`` in pixels and ``counts``.
-    quality: ``noise`` and ``row_offset``, see `sampling.summary`, and ``collars``: the value and share of pixels of the
-        `collar` of an image, by side.
+    collars: the value and share of pixels of the `collar` of an image, by side.
     cells: the local ranges, see `LocalRanges.report`.
     """
 
@@ -83,7 +82,7 @@ class Found:
     matched: float
     levels: tuple[Level, ...]
     histogram: dict[str, list[float]] = field(default_factory=dict)
-    quality: dict[str, Any] = field(default_factory=dict)
+    collars: dict[str, Any] = field(default_factory=dict)
     cells: dict[str, Any] = field(default_factory=dict)
 
     @property

@@ -26,7 +26,7 @@ def match_whole(
     """
     frame = Frame.of_whole(Window(0, 0, *left.shape))
     windows = patch_windows(frame, config, ranges)
-    views = _view(left, windows[0]), _view(right, windows[1])
+    views = cut(whole_view(left), windows[0]), cut(whole_view(right), windows[1])
     patch = match_patch(views, frame, config, statistics, ranges)
     raw, scale = patch.raw, ConfidenceScale(np.nan, np.nan)
     if config.ambiguity:
@@ -35,10 +35,10 @@ def match_whole(
     return postprocess_rows(RawRows.of(raw, patch.right), 0, frame.whole.height, scale, config)
 
 
-def _view(image: np.ma.MaskedArray, window: Window) -> View:
-    """View of a window, which may leave the image."""
+def whole_view(image: np.ma.MaskedArray) -> View:
+    """View of an image."""
     state = np.where(np.ma.getmaskarray(image), NO_DATA, 0).astype(np.uint8)
-    return cut(View(Window(0, 0, *image.shape), image.filled(0), state), window)
+    return View(Window(0, 0, *image.shape), image.filled(0), state)
 
 
 def cut(view: View, window: Window) -> View:

@@ -13,6 +13,7 @@ from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.io import DatasetReader
 
 from sat_intervals.errors import InputError
+from sat_intervals.kernels.rows import RowOffsets
 from sat_intervals.raster import gdal
 from sat_intervals.raster.files_of import check_listed, files_of
 from sat_intervals.raster.georeferencing import Georeferencing
@@ -41,6 +42,7 @@ class Image:
     alpha: int | None  # band that is 0 where there is no data, counted from 1
     mask: str | None  # the user's mask: a file of the same size, not 0 where the image must not be used
     georeferencing: Georeferencing
+    rows: RowOffsets | None = None  # how far rows of a right image lie from those of the left one; taken out on reading
 
 
 def open_image(

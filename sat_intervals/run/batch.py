@@ -22,7 +22,7 @@ from sat_intervals.raster.identity import check_not_replaced
 from sat_intervals.raster.publishing import write_file
 from sat_intervals.run.assemble import end_tiles
 from sat_intervals.run.connection import Connection
-from sat_intervals.run.job import Job, Search, prepare
+from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.pair import (
     Matched,
     check_failures,
@@ -31,7 +31,7 @@ from sat_intervals.run.pair import (
     match_jobs,
     measure_images,
 )
-from sat_intervals.run.search_range import search_range
+from sat_intervals.run.search_range import Finder
 from sat_intervals.run.state import OUTPUTS
 from sat_intervals.run.status import read_report
 from sat_intervals.run.workers import Workers
@@ -70,7 +70,7 @@ def match_batch(
         report = _Report(out)
         report.note({pair.name: {"state": "waiting"} for pair in pairs})
         with Connection(common.cluster, out) as connection:
-            find = partial(search_range, connection, progress=progress)
+            find = Finder(connection, progress)
             jobs: dict[str, Job] = {}
             for number, pair in enumerate(pairs):
                 progress("pairs", number, len(pairs))
@@ -133,7 +133,7 @@ def _files(name: str) -> list[str]:
     return [name]
 
 
-def _prepared(pair: PairOfBatch, out: Path, settings: Config, *, overwrite: bool, find: Search) -> Job:
+def _prepared(pair: PairOfBatch, out: Path, settings: Config, *, overwrite: bool, find: Finder) -> Job:
     def opened(side: str, path: str, mask: str | None) -> Image:
         options = {name: pair.reading.get(f"{side}_{name}", pair.reading.get(name)) for name in ("band", "nodata")}
         return open_image(path, **options, mask=mask)

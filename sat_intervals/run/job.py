@@ -1,18 +1,20 @@
 """Prepare a pair for matching: images, search range, inputs, tiles, and the state of its folder."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from sat_intervals.config import Config, load_config, resolved
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.kernels import FINGERPRINT
+from sat_intervals.kernels.rows import RowOffsets
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.normalization import PairStatistics
+from sat_intervals.match.rows import Survey
 from sat_intervals.match.schedule import blocks_of, handed_bytes
 from sat_intervals.match.search_range import Found
 from sat_intervals.raster import (
@@ -34,8 +36,16 @@ from sat_intervals.store.manifest import MANIFEST, PLACE, StoreError, digest, pl
 from sat_intervals.store.tiles import LAYOUT, ONCE, PARTS, TILES, DamagedTilesError, Store, home_of, store_bytes
 from sat_intervals.tiling import Grid, Tile, Window
 
-Search = Callable[[Image, Image], Found]
-"""Finds the search range of two images."""
+
+class Finds(Protocol):
+    """Finds what a pair needs before its tiles."""
+
+    def search_range(self, left: Image, right: Image) -> Found:
+        """Find the search range."""
+
+    def survey(self, left: Image, right: Image, region: Window, search: tuple[int, int]) -> Survey:
+        """Look at blocks of a region over a search range."""
+
 
 # Settings without effect on tiles; those of the preset itself are listed one by one.
 _NOT_OF_TILES = {"preset", "median", "regularization", "products", "cluster"}
@@ -62,6 +72,7 @@ class Job:
     inputs: dict[str, Any]
     requested: dict[str, Any]
     found: Found | None = None
+    survey: Survey | None = None
     ranges_digest: str | None = None
     local: LocalRanges | None = None
     overwrite: bool = False
@@ -70,8 +81,13 @@ class Job:
     @property
     def manifest(self) -> dict[str, Any]:
         """Return all that decides the bytes of a tile, and where the tiles are."""
-        made = _manifest(self.config, self.inputs, self.store.grid.region, self.ranges_digest)
+        made = _manifest(self.config, self.inputs, self.store.grid.region, self.ranges_digest, self.right.rows)
         return made | {PLACE: None if self.is_home else str(self.store.folder)}
+
+    @property
+    def surveyed(self) -> str:
+        """Return a digest of what was surveyed."""
+        return _surveyed(self.config, self.store.grid.region)
 
     @property
     def is_home(self) -> bool:
@@ -109,9 +125,11 @@ class Job:
             self.store.write(ONCE, "begun")  # fails at once where nothing can be written
             if step != "resume":
                 write_manifest(home_of(self.out), self.manifest)
-            if self.found or self.local:
+            if self.found or self.local or self.survey:
                 found, ranges = self.found and self.found.report(), self.local and self.local.report()
-                self.store.write(ONCE, _RANGE, of=origin_of(self.inputs), found=found, ranges=ranges)
+                of, survey = origin_of(self.inputs), self.survey and self.survey.report()
+                more = {"survey": survey, "surveyed": self.surveyed}
+                self.store.write(ONCE, _RANGE, of=of, found=found, ranges=ranges, of_rows=more)
         except OSError as error:
             way_out = "make room, check its rights or choose another folder" if self.store.folder.is_local else _REMOTE
             raise StoreError(f"{self.store.folder} cannot be used: {error.strerror or error}: {way_out}") from error
@@ -193,12 +211,16 @@ def prepare(
     window: Window | None = None,
     overwrite: bool = False,
     pair: str = "",
-    find: Search | None = None,
+    find: Finds | None = None,
 ) -> Job:
-    """Check all that can be checked before tiles are matched; ``find`` finds a range that no earlier run has found."""
+    """Check all that can be checked before tiles are matched; ``find`` finds what no earlier run has found.
+
+    Without ``find`` rows are not looked at.
+    """
     config, out = resolved(load_config(config)), Path(out)
     requested = config.disparity.model_dump(mode="json")
     left, right = checked_pair(left, right, config)
+    images = left, right
     region = checked_region(left, window)
     if not config.disparity.is_auto:
         check_tiles(fitted_to_jobs(config), region)
@@ -207,35 +229,54 @@ def prepare(
     with suppress(StoreError):
         before = read_manifest(home_of(out)) or read_report(out) or {}
     inputs = describe_inputs(left, right, config, identities(before.get("inputs", {})))
-    config, found, local = searched(config, left, lambda: _found(out, before, inputs, find, left, right))
+    known = _known(out, before, inputs)
+    config, found, local = searched(config, left, lambda: _found(known, find, *images))
     checked_pair(left, right, config)
     config = fitted_to_jobs(config)
     check_tiles(config, region)
+    survey = _survey(known, find, left, right, config, region)
+    if survey and config.rows == "auto":
+        right = replace(right, rows=survey.taken)
     read = [*identities(inputs), *(files_of(config.disparity.grid) if config.disparity.grid else ())]
     ranges = digest(local.report()) if local else None
-    run = digest(_manifest(config, inputs, region, ranges))
+    run = digest(_manifest(config, inputs, region, ranges, right.rows))
     store = config.cluster.store
     folder = folder_at(f"{folder_at(store)}/{'-'.join(filter(None, (pair, run)))}" if store else home_of(out))
     kept = Store(folder, Grid(region, config.tiles.size), run)
     check_not_replaced(read, [out / name for name in OUTPUTS], [home_of(out)])
-    return Job(left, right, config, kept, out, inputs, requested, found, ranges, local, overwrite)
+    return Job(left, right, config, kept, out, inputs, requested, found, survey, ranges, local, overwrite)
 
 
-def _found(
-    out: Path, before: Mapping[str, Any], inputs: Mapping[str, Any], find: Search | None, left: Image, right: Image
-) -> Found:
-    """Return the search range that an earlier run of the same images has found, else find it."""
-    kept: dict[str, Any] | None = None
+def _known(out: Path, before: Mapping[str, Any], inputs: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return what an earlier run of the same images has found: ``found``, ``survey`` and what was ``surveyed``."""
     if PLACE in before:
         store = Store(place_of(home_of(out), before), _NO_TILES, "")
-        kept = (store.meta(ONCE, _RANGE, origin_of(inputs)) or {}).get("found")
-    elif before.get("search") and before.get("origin") == origin_of(inputs):
-        kept = before["search"]
-    if kept:
-        return Found.of_report(kept)
+        kept = store.meta(ONCE, _RANGE, origin_of(inputs)) or {}
+        return {**kept, **kept.get("of_rows", {})}
+    if before.get("origin") == origin_of(inputs):
+        return {"found": before["search"], "survey": before["survey"], "surveyed": before["surveyed"]}
+    return {}
+
+
+def _found(known: Mapping[str, Any], find: Finds | None, left: Image, right: Image) -> Found:
+    if known.get("found"):
+        return Found.of_report(known["found"])
     if find is None:
         raise SatIntervalsError("the search range is auto: give it as numbers")
-    return find(left, right)
+    return find.search_range(left, right)
+
+
+def _survey(
+    known: Mapping[str, Any], find: Finds | None, left: Image, right: Image, config: Config, region: Window
+) -> Survey | None:
+    if known.get("survey") and known["surveyed"] == _surveyed(config, region):
+        return Survey.of_report(known["survey"])
+    search = config.disparity.minimum, config.disparity.maximum
+    return find.survey(left, right, region, search) if find else None
+
+
+def _surveyed(config: Config, region: Window) -> str:
+    return digest({"region": asdict(region), "search": [config.disparity.minimum, config.disparity.maximum]})
 
 
 def origin_of(inputs: Mapping[str, Any]) -> str:
@@ -258,7 +299,9 @@ def remove_tiles(out: Path) -> None:
 _version = cache(lambda: version("sat-intervals"))  # reading it takes 2 ms, and each tile compares manifests
 
 
-def _manifest(config: Config, inputs: Mapping[str, Any], region: Window, ranges: str | None) -> dict[str, Any]:
+def _manifest(
+    config: Config, inputs: Mapping[str, Any], region: Window, ranges: str | None, rows: RowOffsets | None
+) -> dict[str, Any]:
     """Return all that decides the bytes of a tile; of a calibration only its levels."""
     settings = config.model_dump(mode="json", exclude=_NOT_OF_TILES)
     levels = config.cuts
@@ -266,6 +309,7 @@ def _manifest(config: Config, inputs: Mapping[str, Any], region: Window, ranges:
         settings["interval"] = {"high": levels.high, "low": levels.low, "steps": config.bound_steps}
     return {
         **({"local_ranges": ranges} if ranges else {}),
+        **({"rows": asdict(rows)} if rows else {}),
         "version": _version(),
         "kernels": FINGERPRINT,
         "layout": LAYOUT,

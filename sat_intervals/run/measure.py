@@ -35,6 +35,7 @@ from sat_intervals.run.connection import Connection
 from sat_intervals.run.inputs import check_unchanged
 from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.pair import check_failures, match_jobs, measure_images
+from sat_intervals.run.search_range import Finder
 from sat_intervals.run.workers import Workers
 from sat_intervals.store.lock import locked
 from sat_intervals.tiling import Window
@@ -124,9 +125,8 @@ def _of_subject(
     """Match a subject, with two levels of the ladder at a time, and measure it."""
     gauge: _Gauge | None = None
     with ExitStack() as stack:
-        jobs = [
-            _begun(subject, levels[first : first + 2], folder / str(first), stack) for first in range(0, levels.size, 2)
-        ]
+        find, firsts = Finder(workers, progress), range(0, levels.size, 2)
+        jobs = [_begun(find, subject, levels[first : first + 2], folder / str(first), stack) for first in firsts]
         # several tiles of one job keep all workers busy; stores of all jobs at once would fill the disk
         batches = [jobs] if len(jobs[0].store.grid) == 1 else [[job] for job in jobs]
         for number, batch in enumerate(batches):
@@ -146,10 +146,10 @@ def _of_subject(
     return gauge.measured()
 
 
-def _begun(subject: Subject, levels: np.ndarray, out: Path, stack: ExitStack) -> Job:
+def _begun(find: Finder, subject: Subject, levels: np.ndarray, out: Path, stack: ExitStack) -> Job:
     """Prepare the job that matches a subject at two levels; open its store."""
     config = _at_levels(subject.config, float(levels[0]), float(levels[1]), None)
-    job = prepare(subject.left, subject.right, out, config, window=subject.window, pair=out.parent.name)
+    job = prepare(subject.left, subject.right, out, config, window=subject.window, pair=out.parent.name, find=find)
     job = replace(job, has_files=False)
     job.begin()
     stack.callback(job.store.remove)

@@ -10,7 +10,6 @@ from sat_intervals.config import load_config
 from sat_intervals.errors import RunError
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics, blocks, statistics_of
 from sat_intervals.match.schedule import Schedule
-from sat_intervals.match.search_range import Found
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress, add_seconds, logged_stage
 from sat_intervals.raster import Image
@@ -18,7 +17,7 @@ from sat_intervals.results import open_run
 from sat_intervals.run.assemble import assemble, end_tiles
 from sat_intervals.run.connection import Connection
 from sat_intervals.run.job import Job, prepare
-from sat_intervals.run.search_range import search_range
+from sat_intervals.run.search_range import Finder
 from sat_intervals.run.tile import match_block, measure_block, trace_block
 from sat_intervals.run.workers import Task, Workers, check_not_full, reason, results
 from sat_intervals.store.lock import locked
@@ -75,13 +74,9 @@ def match_pair(
     """
     config, out, seconds = load_config(config), Path(out), dict[str, float]()
     with Connection(config.cluster, out) as connection:
-
-        def find(left: Image, right: Image) -> Found:
-            with logged_stage(seconds, "start.range"):
-                return search_range(connection, left, right, progress)
-
         with logged_stage(seconds, "start"):
-            job = prepare(left, right, out, config, window=window, overwrite=overwrite, find=find)
+            finder = Finder(connection, progress, seconds)
+            job = prepare(left, right, out, config, window=window, overwrite=overwrite, find=finder)
         with locked(out):
             if not job.begin():
                 report = complete_before(job)

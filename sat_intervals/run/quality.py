@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.config import Disparity, unreached
-from sat_intervals.match.sampling import Look, summary
+from sat_intervals.match.rows import Survey
 from sat_intervals.raster import Image, read_window
 from sat_intervals.run.job import Job
 from sat_intervals.tiling import Window
@@ -28,14 +28,12 @@ def is_plain(image: Image) -> bool:
     return image.nodata is None and not image.use_mask and image.alpha is None and image.mask is None
 
 
-def quality_of(job: Job, records: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the quality of a pair, see `Found`: as the search for the range measured it, else from the tiles."""
-    if job.found:
-        return job.found.quality
-    looks = [Look(**look) for _, record in sorted(records.items()) for look in record["looks"]]
+def quality_of(job: Job) -> dict[str, Any]:
+    """Return the quality of a pair: ``noise``, see `noise_of`, and ``collars``, see `Found`."""
     region = job.store.grid.region
-    collars = {side: _collar(image, region) for side, image in (("left", job.left), ("right", job.right))}
-    return summary(looks) | {"collars": {side: collar for side, collar in collars.items() if collar}}
+    found = {side: _collar(image, region) for side, image in (("left", job.left), ("right", job.right))}
+    collars = job.found.collars if job.found else {side: collar for side, collar in found.items() if collar}
+    return {"noise": job.survey and job.survey.noise, "collars": collars}
 
 
 def _collar(image: Image, region: Window) -> dict[str, float] | None:
@@ -67,28 +65,42 @@ def warnings_of(job: Job, counts: dict[str, Any], quality: dict[str, Any]) -> li
         )
     if missed := unreached(job.config):
         lines.append(f"{path}: {missed}")
-    paths = {"left": job.left.path, "right": job.right.path}
-    return lines + doubts(quality, paths, is_census=job.config.cost.method == "census" and job.config.preset == "paper")
+    is_census = job.config.cost.method == "census" and job.config.preset == "paper"
+    doubts = doubts_of(quality["collars"], job.survey, (job.left.path, job.right.path), is_census=is_census)
+    return lines + doubts + rows_left(job.survey, job.config.rows, job.right.path)
 
 
-def doubts(quality: dict[str, Any], paths: dict[str, str], *, is_census: bool = True) -> list[str]:
+def doubts_of(
+    collars: Mapping[str, Any], survey: Survey | None, paths: tuple[str, str], *, is_census: bool = True
+) -> list[str]:
     """Return the warnings about a pair; ``is_census``: it is matched with the penalties for clean images."""
     lines = [
-        f"{paths[side]}: {100 * collar['share']:.0f} % of the pixels are exactly {collar['value']:g}, along its "
-        f"borders, and no no-data value is declared: if they are no data, give --{side}-nodata {collar['value']:g}"
-        for side, collar in quality["collars"].items()
+        f"{path}: {100 * collars[side]['share']:.0f} % of the pixels are exactly {collars[side]['value']:g}, along its "
+        f"borders, and no no-data value is declared: if they are no data, give --nodata {collars[side]['value']:g}"
+        for side, path in zip(("left", "right"), paths, strict=True)
+        if side in collars
     ]
-    if abs(quality["row_offset"] or 0) > _ROW_OFFSET:
+    if survey and (survey.noise or 0) > _NOISE and is_census:
         lines.append(
-            f"{paths['left']} and {paths['right']}: rows differ by {abs(quality['row_offset']):.1f} px in the median: "
-            "resample the pair"
-        )
-    if (quality["noise"] or 0) > _NOISE and is_census:
-        lines.append(
-            f"{paths['left']} and {paths['right']}: matching pixels differ {quality['noise']:.2f} times as much as "
+            f"{paths[0]} and {paths[1]}: matching pixels differ {survey.noise:.2f} times as much as "
             "random pixels, the pair is noisy: try --preset satellite, or find penalties with calibrate --tune"
         )
     return lines
+
+
+def rows_left(survey: Survey | None, rows: str, path: str) -> list[str]:
+    """Return warnings of rows that differ in what is matched."""
+    if survey is None or survey.rows is None:
+        return []
+    found = survey.rows
+    if rows == "none" and survey.taken and found.before[0] > _ROW_OFFSET:
+        return [f"{path}: rows differ by {found.before[0]:.1f} px in the median: match with --rows auto"]
+    if found.has_jitter:
+        return [
+            f"{path}: a smooth function leaves {found.after[0]:.2f} px of row offset in the median, "
+            f"{found.after[1]:.2f} px in 90 % of the places: jitter or joins of detectors, or too little texture"
+        ]
+    return []
 
 
 def _ends(counts: dict[str, Any], search: Disparity) -> str:

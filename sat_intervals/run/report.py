@@ -67,7 +67,7 @@ def report_of(
     tally = Tally(config.disparity.count, config.disparity.minimum)
     for part in parts:
         tally.merge(part.get("counts", {}))
-    counts, quality = tally.report(), quality_of(job, tables.records)
+    counts, quality = tally.report(), quality_of(job)
     of_tiles = [record["seconds"] for record in tables.records.values()]
     seconds |= {f"tiles.{stage}": sum(each[stage] for each in of_tiles) for stage in ("read", "match", "write")}
     seconds["total"] = sum(value for stage, value in seconds.items() if "." not in stage)
@@ -77,6 +77,9 @@ def report_of(
         "settings": config.model_dump(mode="json"),
         "requested": {"disparity": job.requested},
         "search": job.found and job.found.report(),
+        "survey": job.survey and job.survey.report(),
+        "surveyed": job.surveyed,
+        "rows": job.right.rows and asdict(job.right.rows),
         "origin": origin_of(job.inputs),
         "local_ranges": job.local and job.local.report() | {"share": job.local.share},
         "inputs": job.inputs,

@@ -1,17 +1,20 @@
 """Find the search range of a pair on a cluster: workers reduce the images block by block and look at samples."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 
 from sat_intervals.config import Cluster
-from sat_intervals.errors import RunError
+from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.memory import check_memory
 from sat_intervals.match.normalization import BLOCK, blocks
-from sat_intervals.match.sampling import Look, Sample, coarse_rows, look, samples, summary
+from sat_intervals.match.rows import Survey, surveyed
+from sat_intervals.match.sampling import Look, Spot, look, spots
 from sat_intervals.match.search_range import (
     Found,
     NoRangeError,
@@ -23,8 +26,8 @@ from sat_intervals.match.search_range import (
     settings,
 )
 from sat_intervals.match.warm_up import compile_kernels
-from sat_intervals.progress import Progress
-from sat_intervals.raster import Image, read_window
+from sat_intervals.progress import Progress, logged_stage
+from sat_intervals.raster import Image, read_views, read_window
 from sat_intervals.run.connection import Connection
 from sat_intervals.run.quality import COLLAR, is_plain
 from sat_intervals.run.workers import Task, Workers, picklable_errors, reason, results
@@ -42,11 +45,36 @@ def reduce_block(image: Image, block: Window, step: Step) -> tuple[np.ndarray, f
         return reduced(pixels, state, step), float(smallest)
 
 
-def look_at(left: Image, right: Image, sample: Sample) -> Look | None:
-    """Match a sample; runs on a worker."""
+def look_at(left: Image, right: Image, spot: Spot) -> Look | None:
+    """Look at a block; runs on a worker."""
     with picklable_errors():
-        views = (read_window(image, window) for image, window in zip((left, right), sample.views, strict=True))
-        return look(sample, *views)
+        return look(spot, *read_views((left, right), spot.views))
+
+
+@dataclass(frozen=True)
+class Finder:
+    """Finds with workers what a pair needs before its tiles; ``seconds`` gets the time that it takes."""
+
+    workers: Workers
+    progress: Progress
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def search_range(self, left: Image, right: Image) -> Found:
+        """Find the search range, see `search_range`."""
+        with logged_stage(self.seconds, "start.range"):
+            return search_range(self.workers, left, right, self.progress)
+
+    def survey(self, left: Image, right: Image, region: Window, search: tuple[int, int]) -> Survey:
+        """Look at blocks of a region of the left image over a search range: noise and row offsets."""
+        with logged_stage(self.seconds, "start.rows"):
+            compile_kernels(settings(0, 3))
+            chosen = [(left, right, spot) for spot in spots(region, *search)]
+            results = sorted(_results(self.workers, look_at, chosen, self.progress), key=itemgetter(0))
+            looks = [found for _, found in results if found is not None]
+            try:
+                return surveyed(looks, right.height, right.width)
+            except SatIntervalsError as error:
+                raise SatIntervalsError(f"{left.path} and {right.path}: {error}") from None
 
 
 def search_range(workers: Workers, left: Image, right: Image, progress: Progress) -> Found:
@@ -66,21 +94,20 @@ def search_range(workers: Workers, left: Image, right: Image, progress: Progress
             pixels[found] = np.nan
         small.append(pixels)
     try:
-        searched, matches = find_range(small[0], small[1], step, (left.height, left.width))
+        found_range, _ = find_range(small[0], small[1], step, (left.height, left.width))
     except NoRangeError as error:
         raise NoRangeError(
             f"{left.path} and {right.path}: {error}: give the search range with --disparity MIN MAX, or check that the "
             "images are an epipolar pair"
         ) from None
-    chosen = [(left, right, sample) for sample in samples(matches, coarse_rows(*matches.images, matches))]
-    looks = [found for _, found in _results(workers, look_at, chosen, lambda stage, done, total: None)]
-    return replace(searched, quality=summary(looks) | {"collars": collars})
+    return replace(found_range, collars=collars)
 
 
-def find_here(left: Image, right: Image, progress: Progress) -> Found:
-    """Find the search range of a pair with the cores of this machine; see `search_range`."""
+@contextmanager
+def finder_here(progress: Progress) -> Iterator[Finder]:
+    """Yield a finder that uses the cores of this machine."""
     with Connection(Cluster(), Path()) as connection:
-        return search_range(connection, left, right, progress)
+        yield Finder(connection, progress)
 
 
 def _reduced(workers: Workers, image: Image, step: Step, progress: Progress) -> tuple[np.ndarray, float]:

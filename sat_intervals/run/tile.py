@@ -20,7 +20,6 @@ from sat_intervals.match.patch import (
     match_costed,
     path_window,
 )
-from sat_intervals.match.sampling import Look, look_in_tile
 from sat_intervals.match.schedule import Step, needs
 from sat_intervals.match.seams import seam_lines
 from sat_intervals.products import NO_DISPARITY
@@ -31,10 +30,7 @@ from sat_intervals.run.source import Source, costed, frame_of, read_source
 from sat_intervals.run.workers import computing, picklable_errors
 from sat_intervals.store.arrays import numbered
 from sat_intervals.store.tiles import BORDERS
-from sat_intervals.tiling import Tile, Views, Window
-
-# Tiles along each side of the grid, at most, in which the quality of a pair is looked at.
-_LOOKS = 4
+from sat_intervals.tiling import Tile, Window
 
 Handed = dict[Place, list[Edge]]
 """What tiles hand on in a wavefront: for each view, by place in the grid of tiles."""
@@ -98,22 +94,12 @@ def _match_tile(
         del costs, borders
         with timed(seconds, "write"):
             products = _tile_products(patch, tile, job)
-        looks = [look._asdict() for look in _looks(views, tile, job)]
     usable = {side: int((view.state == 0).sum()) for side, view in zip(("left", "right"), views, strict=True)}
     if handed:
         handed[LAST][_place(tile)] = patch.leaving
     with timed(seconds, "write"):
-        job.store.write_tile(tile, products, usable_pixels=usable, seconds=seconds, looks=looks)
+        job.store.write_tile(tile, products, usable_pixels=usable, seconds=seconds)
     _LOG.debug("tile %s: %s", tile.name, ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items()))
-
-
-def _looks(views: Views, tile: Tile, job: Job) -> list[Look]:
-    """Look at the quality of the pair in some of the tiles, unless the search for its range did so."""
-    grid, search = job.store.grid, job.config.disparity
-    steps = -(-grid.rows // _LOOKS), -(-grid.columns // _LOOKS)
-    if job.found or not job.has_files or tile.grid_row % steps[0] or tile.grid_column % steps[1]:
-        return []
-    return look_in_tile(views, tile.core, search.minimum, search.maximum)
 
 
 def _trace_block(job: Job, block: Tile, wavefront: int) -> dict[str, float]:
