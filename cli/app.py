@@ -40,12 +40,12 @@ STEPS: dict[str, tuple[click.Command, ...]] = {
     "Try and prepare": (demo, search_range, plan, config),
     "Match": (match, batch, status),
     "Look": (plot, report, project),
-    "Heights": (surface, triangulate, dsm),
+    "Heights": (surface, dsm, triangulate),
     "Compare with a truth": (reference, evaluate, calibrate, ablate),
     "Use elsewhere": (export, stac),
 }
 # The most common commands, which the command without arguments shows.
-_DAILY = (demo, match, status, report, project, surface, triangulate, dsm, evaluate, export)
+_DAILY = (demo, match, status, report, project, surface, dsm, evaluate, export)
 
 
 class _Commands(click.Group):

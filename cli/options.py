@@ -116,7 +116,8 @@ def sensor_options(command: Command) -> Command:
 def note_geometry(outs: Sequence[Path], sensor_files: Sequence[SensorFiles]) -> None:
     """Note the models and grids of runs in their folders, if any are given."""
     if sensor_files and len(sensor_files) != len(outs):
-        raise click.UsageError(f"{len(sensor_files)} sets of models and grids for {len(outs)} OUT: give one for each.")
+        given = f"models and grids are given {len(sensor_files)} times for {len(outs)} OUT"
+        raise click.UsageError(f"{given}: give them for each, or for none.")
     from sat_intervals.heights.geometry import set_geometry
 
     for out, files in zip(outs, sensor_files, strict=False):

@@ -15,7 +15,7 @@ def project(out: Path) -> None:
 
     \b
     OUT/project.qgz           images, disparity, width, confidence, validity, and
-                              heights with hillshade after triangulate and dsm
+                              heights with hillshade after dsm
     OUT/width.vrt             interval width, computed when it is read
     OUT/dsm_half_width.vrt    half the width of the intervals of heights
     OUT/*.qml                 style of the raster of the same name

@@ -76,11 +76,12 @@ def triangulate(
 
 def say_geometry(console: "Console", reports: dict[str, Any]) -> None:
     """Print how models and grids of each run fit, and what is wrong with them."""
-    for report in reports.values():
-        console.say(
-            f"lines of sight miss each other by {report['median_residual']:.2g} m in the median (so models and grids "
-            "fit together; neither the matches nor whether they belong to these images is tested)"
-        )
+    for out, report in reports.items():
+        if report["median_residual"] <= _SUSPECT:
+            console.say(
+                f"{out}: lines of sight miss each other by {report['median_residual']:.2g} m in the median (so models "
+                "and grids fit together; neither the matches nor whether they belong to these images is tested)"
+            )
     for line in geometry_warnings(reports):
         click.echo(line, err=True)
 

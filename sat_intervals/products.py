@@ -108,6 +108,11 @@ class Bands(NamedTuple):
         return np.asarray(self.validity & INVALID == 0)
 
     @property
+    def matched(self) -> np.ndarray:
+        """Return the disparities of valid pixels, NaN elsewhere."""
+        return np.where(self.valid, self.disparity, np.float32(np.nan))
+
+    @property
     def known(self) -> np.ndarray:
         """Return the mask of pixels with an interval and a truth."""
         return np.asarray(np.isfinite(self.truth) & np.isfinite(self.lower))

@@ -76,7 +76,7 @@ def make_surface(
     runs without intervals); ``bounds``; ``calibration`` (its name, None without one); ``median_half_width`` (metres)
     and ``wide``, the share of cells with bounds whose half width exceeds 20 m, both None without bounds; ``outliers``,
     ``open`` and ``poor_cells``, the numbers of points and cells left out; ``geometry``, for each folder, how models and
-    grids fit, see `triangulate`.
+    grids fit, see `set_geometry`, and ``lost``, the share of the region where they have no values.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def make_surface(
     clouds = [PointCloud(one.run, on_map(one.lattice, projection, str(one.run.out)), choices) for one in geometries]
     tally = Tally()
     with ThreadPoolExecutor(usable_cores()) as threads:
-        cells = _checked_grid(clouds, grid, radius) if grid else _cells(threads, clouds, resolution, radius)
+        cells = _cells(threads, clouds, resolution, radius, grid)
         place = north_up(projection.crs, cells.left, cells.top, cells.resolution)
         with OutputWriter(path.parent, [surface_file(path.name)], cells.rows, cells.columns, place, tags) as writer:
             for row, bands, counts in strips(threads, clouds, cells, radius, choices):
@@ -134,8 +134,7 @@ def _geometries(
         runs.append(run)
     geometries: list[Geometry] = []
     for run in runs:
-        progress("geometry", len(geometries), len(runs))
-        geometries.append(geometry_of(run))
+        geometries.append(geometry_of(run, progress))
         run.check_kept([path], [run.out / FILE, *geometries[-1].files, *given])
     return geometries
 
@@ -210,15 +209,22 @@ def _grid_of(path: Path, given: str | None) -> tuple[Cells, str]:
     return Cells(place.transform.c, place.transform.f, across, rows, columns), crs
 
 
-def _cells(threads: ThreadPoolExecutor, clouds: Sequence[PointCloud], resolution: float, radius: float) -> Cells:
-    """Return the cells that the points of all runs reach."""
+def _cells(
+    threads: ThreadPoolExecutor, clouds: Sequence[PointCloud], resolution: float, radius: float, grid: Cells | None
+) -> Cells:
+    """Return the cells that the points of all runs reach, or those of a given raster."""
     extent = joined(cloud.extent(threads) for cloud in clouds)
     if extent is None:
         raise SatIntervalsError(
             f"no valid pixel in {', '.join(str(cloud.run.out) for cloud in clouds)}, or all points are left out as "
             "outliers or open intervals: give runs with valid pixels, or leave out fewer"
         )
-    cells = Cells.over(extent.grown(radius), resolution)
+    extent = extent.grown(radius)
+    if grid is not None:
+        if not extent.intersects(grid.extent(Window(0, 0, grid.rows, grid.columns))):
+            raise SatIntervalsError("no point reaches the grid of the given raster: give one of the same place")
+        return grid
+    cells = Cells.over(extent, resolution)
     pixels = sum(cloud.run.region.height * cloud.run.region.width for cloud in clouds)
     if cells.rows * cells.columns > _CELLS_PER_PIXEL * pixels:
         raise SatIntervalsError(
@@ -226,11 +232,3 @@ def _cells(threads: ThreadPoolExecutor, clouds: Sequence[PointCloud], resolution
             "choose a coarser --resolution, or runs of one place"
         )
     return cells
-
-
-def _checked_grid(clouds: Sequence[PointCloud], grid: Cells, radius: float) -> Cells:
-    """Return the cells of a given raster; raise if no point can reach them."""
-    place = grid.extent(Window(0, 0, grid.rows, grid.columns)).grown(radius)
-    if not any(True for cloud in clouds for _ in cloud.ground.windows(place)):
-        raise SatIntervalsError("no point reaches the grid of the given raster: give one of the same place")
-    return grid

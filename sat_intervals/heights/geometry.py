@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.heights.lattice import Lattice
+from sat_intervals.progress import Progress
 from sat_intervals.raster import write_file
 from sat_intervals.raster.identity import identity
 from sat_intervals.results import Run, open_run
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 FILE = "geometry.json"
 _KINDS = "left_model", "right_model", "left_grid", "right_grid"
-_GIVE = "give --left-model, --right-model, --left-grid and --right-grid"
+_GIVE = "give --left-model, --right-model, --left-grid and --right-grid, for each OUT"
 
 
 @dataclass(frozen=True)
@@ -74,15 +75,16 @@ def set_geometry(
     return report
 
 
-def geometry_of(run: Run) -> Geometry:
+def geometry_of(run: Run, progress: Progress = lambda stage, done, total: None) -> Geometry:
     """Return the geometry of a run; raise if `set_geometry` was not called for it, or a file has changed since."""
     from sat_intervals.heights.sensors import lattice_of
 
     paths = _noted(run)
     sensors, report = _sensors(run, paths)
     search = run.config.disparity
-    lattice = lattice_of(sensors, run.region, search.minimum, search.maximum)
-    report["lost"] = float(np.isnan(lattice.nodes[..., 0]).all(axis=2).mean())
+    lattice = lattice_of(sensors, run.region, search.minimum, search.maximum, progress)
+    known = np.isfinite(lattice.nodes[..., 0]).all(axis=2)
+    report["lost"] = 1 - float((known[:-1, :-1] & known[1:, :-1] & known[:-1, 1:] & known[1:, 1:]).mean())
     return Geometry(run, paths, sensors, lattice, report)
 
 
@@ -117,6 +119,7 @@ def _noted(run: Run) -> list[Path]:
     if images != _images(run):
         raise SatIntervalsError(f"{file} is of other images than {run.out} now: {_GIVE}")
     for path, record in zip(paths, known, strict=True):
+        check_file(Path(path), _GIVE)
         if identity(path, {path: record}).get("sha256") != record.get("sha256"):
             raise SatIntervalsError(f"{path} has changed since {file} was written: {_GIVE}")
     return [Path(path) for path in paths]

@@ -28,6 +28,11 @@ class Extent(NamedTuple):
         begins = self.left <= other.left and self.bottom <= other.bottom
         return begins and other.right <= self.right and other.top <= self.top
 
+    def intersects(self, other: "Extent") -> bool:
+        """Return whether both share a point."""
+        meets = max(self.left, other.left) <= min(self.right, other.right)
+        return meets and max(self.bottom, other.bottom) <= min(self.top, other.top)
+
     def grown(self, margin: float) -> "Extent":
         """Return the rectangle grown by a margin on all sides."""
         return Extent(self.left - margin, self.bottom - margin, self.right + margin, self.top + margin)
@@ -100,12 +105,12 @@ def on_map(lattice: Lattice, projection: Projection, name: str) -> Lattice:
     known = np.isfinite(longitude)
     if np.isnan(down[known]).any():
         raise SatIntervalsError(
-            f"the grid of geoid heights does not cover the points of {name}, at longitudes "
+            f"the grid of geoid heights does not cover the region of {name}, at longitudes "
             f"{np.nanmin(longitude):.4f} to {np.nanmax(longitude):.4f}, latitudes {np.nanmin(latitude):.4f} to "
             f"{np.nanmax(latitude):.4f}: give one that covers them"
         )
     if not (np.isfinite(x[known]).all() and np.isfinite(y[known]).all()):
-        raise SatIntervalsError(f"points of {name} are outside the domain of {projection.crs}: give another CRS")
+        raise SatIntervalsError(f"places of {name} are outside the domain of {projection.crs}: give another CRS")
     return replace(lattice, nodes=np.stack([np.where(known, x, np.nan), np.where(known, y, np.nan), height - down], -1))
 
 

@@ -16,7 +16,7 @@ from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.lattice import WINDOW, Extent, Ground, Lattice, joined
 from sat_intervals.kernels.disparity import median
 from sat_intervals.kernels.splat import BOUNDED, LOWER, UPPER, empty_cells, gather, mean_heights, medians, splat
-from sat_intervals.products import OPEN_ABOVE, OPEN_BELOW
+from sat_intervals.products import OPEN_ABOVE, OPEN_BELOW, Bands
 from sat_intervals.results import Run
 from sat_intervals.tiling import Grid, Tile, Window
 
@@ -53,7 +53,7 @@ class Cells:
         )
 
 
-class _Points(NamedTuple):
+class Points(NamedTuple):
     """Points of a window of pixels, each ``(rows, columns)``; metres, NaN height where none contributes."""
 
     x: np.ndarray
@@ -87,8 +87,8 @@ class PointCloud:
         return found
 
     def _extent(self, window: Window) -> Extent | None:
-        points, _ = self._points(window)
-        x, y = (values[np.isfinite(points.height)] for values in (points.x, points.y))
+        (x, y, height), _ = self._places(window, self.run.read_bands(window))
+        x, y = x[np.isfinite(height)], y[np.isfinite(height)]
         return Extent(float(x.min()), float(y.min()), float(x.max()), float(y.max())) if x.size else None
 
     def splat(
@@ -105,7 +105,7 @@ class PointCloud:
         for source in self.ground.windows(place.grown(radius)):
             if ended.is_set():
                 break
-            points, left_out = self._points(source)
+            points, left_out = self.points(source)
             column, row = (points.x - place.left) / cells.resolution, (place.top - points.y) / cells.resolution
             inside = (column >= 0) & (column < window.width) & (row >= 0) & (row < window.height)
             for name, mask in (("points", np.isfinite(points.height)), *left_out.items()):
@@ -120,27 +120,30 @@ class PointCloud:
             _set_medians(gathered, near, reach)
         return gathered, counts
 
-    def _points(self, window: Window) -> tuple[_Points, dict[str, np.ndarray]]:
+    def points(self, window: Window) -> tuple[Points, dict[str, np.ndarray]]:
         """Return the points of a window, and the masks of those left out by the reason."""
         bands, lattice = self.run.read_bands(window), self.ground.lattice
-        x, y, height = lattice.points(window, np.where(bands.valid, bands.disparity, np.float32(np.nan)))
+        (x, y, height), left_out = self._places(window, bands)
         # Which bound gives the higher point depends on the geometry of the pair.
         (one,), (other,) = (lattice.points(window, bound, _HEIGHT) for bound in (bands.lower, bands.upper))
-        left_out: dict[str, np.ndarray] = {}
+        return Points(x, y, height, np.minimum(one, other), np.maximum(one, other), bands.confidence), left_out
+
+    def _places(self, window: Window, bands: Bands) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Return x, y and height ``(3, rows, columns)`` of the points that contribute, and the masks of `points`."""
+        places = self.ground.lattice.points(window, bands.matched)
+        height, left_out = places[2], dict[str, np.ndarray]()
         if self._choices.outliers is not None:
             left_out["outliers"] = self._outlying(window, self._choices.outliers)
             height[left_out["outliers"]] = np.nan
         if not self._choices.keeps_open:
             left_out["open"] = np.isfinite(height) & (bands.validity & np.uint16(OPEN_BELOW | OPEN_ABOVE) != 0)
             height[left_out["open"]] = np.nan
-        return _Points(x, y, height, np.minimum(one, other), np.maximum(one, other), bands.confidence), left_out
+        return places, left_out
 
     def _outlying(self, window: Window, limit: float) -> np.ndarray:
         """Return the mask of points farther than a limit (metres) from the median of the points near them."""
         around = window.grown(_NEAR, _NEAR).clipped(Window(0, 0, *self.run.shape))
-        bands = self.run.read_bands(around)
-        disparity = np.where(bands.valid, bands.disparity, np.float32(np.nan))
-        (height,) = self.ground.lattice.points(around, disparity, _HEIGHT)
+        (height,) = self.ground.lattice.points(around, self.run.read_bands(around).matched, _HEIGHT)
         known = np.isfinite(height)
         base = np.median(height[known]) if known.any() else 0  # float32 then keeps millimetres
         away = np.where(known, height - base, 0)

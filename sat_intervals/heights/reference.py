@@ -5,7 +5,6 @@ Rasters are seen pixel by pixel; points go through inverse location. Both are re
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any, BinaryIO
@@ -14,13 +13,13 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.geometry import FILE, Geometry, geometry_of
-from sat_intervals.heights.lattice import on_map
+from sat_intervals.heights.lattice import Lattice, on_map
 from sat_intervals.heights.location import GroundLattice, Location
 from sat_intervals.heights.point_files import PointFile
 from sat_intervals.heights.point_sight import PointSight
 from sat_intervals.heights.raster_sight import RasterSight
 from sat_intervals.heights.registering import blocks_of_points, blocks_of_raster
-from sat_intervals.heights.sensors import lattice_of
+from sat_intervals.heights.sensors import check_cover, lattice_of
 from sat_intervals.kernels.registration import LEAST, Registration, register
 from sat_intervals.progress import Progress
 from sat_intervals.raster import HeightRaster, OutputWriter, Projection, Vertical, truth_file, utm_of
@@ -68,7 +67,7 @@ def make_truth(
     """
     run = open_run(out)
     path = run.out / "truth.tif" if path is None else path
-    geometry = geometry_of(run)
+    geometry = geometry_of(run, progress)
     run.check_kept([path], [*geometry.files, reference.path, run.out / FILE])
     work = _Work(geometry, reference)
     found = work.registration(progress) if registers else None
@@ -179,7 +178,12 @@ class _Work:
     def strips(self, shift: np.ndarray, file: BinaryIO, progress: Progress) -> Iterator[tuple[int, np.ndarray]]:
         """Yield the first row and the true disparities of strips from the top; points are kept in an empty file."""
         if isinstance(self._heights, HeightRaster):
-            wider = partial(lattice_of, self._sensors, self.run.region)
+            right_width = self.run.report["inputs"]["right"]["width"]
+
+            def wider(minimum: int, maximum: int) -> Lattice:
+                check_cover(self._sensors, self.run.region, right_width, minimum, maximum)
+                return lattice_of(self._sensors, self.run.region, minimum, maximum)
+
             sight = RasterSight(self._lattice, wider, self._heights, self._projection, shift, self._search)
             strips = sight.strips(self._pixel)
         else:

@@ -37,8 +37,7 @@ def blocks_of_raster(
     cell = max(pixel, raster.cell)
     parts = []
     for window in spread_blocks(Window(0, 0, *run.shape), _SMALLEST):
-        bands = run.read_bands(window)
-        points = lattice.points(window, np.where(bands.valid, bands.disparity, np.float32(np.nan)))
+        points = lattice.points(window, run.read_bands(window).matched)
         points = points[:, np.isfinite(points[2])]
         if points.size:
             x, y, height = points[:, every_nth(points.shape[1])]

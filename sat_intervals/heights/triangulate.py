@@ -1,25 +1,29 @@
 """Export the points of a run, strip by strip: a GeoTIFF of longitude, latitude and heights, or a LAZ file."""
 
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.geometry import FILE, geometry_of
-from sat_intervals.heights.lattice import Lattice, on_map
+from sat_intervals.heights.lattice import WINDOW, Lattice, on_map
+from sat_intervals.heights.point_cloud import PointCloud
 from sat_intervals.products import Bands
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Layer, OutputWriter, Projection, new_file, points_file, utm_of
 from sat_intervals.results import Run, open_input, open_run
-from sat_intervals.tiling import Window
+from sat_intervals.tiling import Grid, Window
 
 # Pixels computed at a time, 300 bytes each; pixels read ahead take 18 bytes.
 _PIXELS = 1 << 18
 # Positions are rounded to 0.01 mm on the ground and 0.1 mm in height, below the error of the lattice. This halves the
 # file.
 _DEGREES, _METRES = 2.0**-33, 2.0**-13
+_ENDINGS = ".tif", ".tiff", ".laz", ".las"
 # Metres: step of the coordinates in a LAS or LAZ file.
 _STEP = 0.001
 
@@ -54,7 +58,9 @@ def triangulate(
     """
     run = out if isinstance(out, Run) else open_run(out)
     path = run.out / "points.tif" if path is None else Path(path)
-    geometry = geometry_of(run)
+    if path.suffix.lower() not in _ENDINGS:
+        raise SatIntervalsError(f"{path}: give a name that ends with {', '.join(_ENDINGS)}")
+    geometry = geometry_of(run, progress)
     run.check_kept([path], [run.out / FILE, *geometry.files])
     write = _write_las if path.suffix.lower() in (".laz", ".las") else _write_raster
     tally = _Tally()
@@ -83,25 +89,37 @@ def _write_las(run: Run, lattice: Lattice, path: Path, tally: "_Tally", progress
     lattice = on_map(lattice, projection, str(run.out))
     header = laspy.LasHeader(version="1.4", point_format=6)
     header.scales, header.offsets = np.full(3, _STEP), np.floor(np.nanmin(lattice.nodes, axis=(0, 1, 2)))
-    header.add_crs(projection.definition)
+    header.add_crs(projection.definition.to_3d())  # whose heights are above the ellipsoid
     for name, meaning in (("lower", "height bound, metres"), ("upper", "height bound, metres"), ("confidence", "")):
         header.add_extra_dim(laspy.ExtraBytesParams(name, "float32", meaning))
     left = Layer(open_input(run.report["inputs"]["left"]), run.region.row, run.region.column)
-    compressed = path.suffix.lower() == ".laz"
-    with new_file(path) as temporary, laspy.open(temporary, "w", header=header, do_compress=compressed) as file:
-        for window, bands in _strips(run):
-            x, y, height = lattice.points(window, np.where(bands.valid, bands.disparity, np.float32(np.nan)))
-            (one,), (other,) = (lattice.points(window, bound, slice(2, 3)) for bound in (bands.lower, bands.upper))
-            known = np.isfinite(height)
+    cloud = PointCloud(run, lattice, SurfaceChoices(keeps_open=True))
+    kind = {"header": header, "do_compress": path.suffix.lower() == ".laz"}
+    with new_file(path) as temporary, _disk_errors(), laspy.open(temporary, "w", **kind) as file:
+        for tile in Grid(Window(0, 0, *run.shape), WINDOW):
+            window = tile.core
+            points, _ = cloud.points(window)
+            known = np.isfinite(points.height)
             record = laspy.ScaleAwarePointRecord.zeros(int(known.sum()), header=header)
-            record.x, record.y, record.z = x[known], y[known], height[known]
+            record.x, record.y, record.z = (values[known] for values in points[:3])
             record.intensity = np.clip(np.nan_to_num(left.read(window)[known]), 0, 65535).astype(np.uint16)
-            record["lower"], record["upper"] = np.minimum(one, other)[known], np.maximum(one, other)[known]
-            record["confidence"] = bands.confidence[known]
+            for name in ("lower", "upper", "confidence"):
+                record[name] = getattr(points, name)[known]
             record.return_number[:] = record.number_of_returns[:] = 1
             file.write_points(record)
-            tally.add(height)
+            tally.add(points.height)
             progress("points", window.row_stop, run.shape[0])
+
+
+@contextmanager
+def _disk_errors() -> Iterator[None]:
+    """Turn errors of the compressor, which writes itself, into those of the system."""
+    import lazrs
+
+    try:
+        yield
+    except lazrs.LazrsError as error:
+        raise OSError(str(error)) from error
 
 
 class _Tally:

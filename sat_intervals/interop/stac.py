@@ -93,7 +93,7 @@ def _link(run: Run, side: str) -> dict[str, str]:
 
 
 def _assets(run: Run) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the key and the content of each asset; points, surface and maps of other runs are left out."""
+    """Yield the key and the content of each asset; surface and maps of other runs are left out."""
     yield "intervals", _raster(run, "intervals.tif", "Disparity, its interval, confidence", BANDS)
     yield "validity", _raster(run, "validity.tif", "Validity flags", (_VALIDITY,))
     if run.has_current("dsm.tif"):

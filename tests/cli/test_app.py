@@ -35,7 +35,7 @@ def test_main__alone_shows_commands_of_every_day_by_step():
     steps = [line.rstrip(":") for line in lines if line.endswith(":")]
     assert steps == [*STEPS]
     shown = [line.split()[0] for line in lines if line.startswith("  ") and line[2] != " "]
-    heights = ["surface", "triangulate", "dsm"]
+    heights = ["surface", "dsm"]
     assert shown == ["demo", "match", "status", "report", "project", *heights, "evaluate", "export"]
     assert "sat-intervals --help lists all" in " ".join(lines)
 

@@ -41,7 +41,7 @@ def _made_up_points(monkeypatch, request):
         monkeypatch.setattr("sat_intervals.heights.dsm.geometry_of", made_up)
 
 
-def made_up(run):
+def made_up(run, progress=None):
     nodes = np.load(run.out / "nodes.npy")
     fit = {"median_residual": 0.0, "lost": 0.0, "beyond": 0.0, "grid_step": 1.0}
     return Geometry(run, [], None, Lattice(nodes, (1.0, 1.0, 2.0 * FAR), run.region, -FAR), fit)
@@ -406,7 +406,7 @@ def test_make_surface__heights_count_from_a_geoid(tmp_path):
 
 def test_make_surface__refuses_a_geoid_that_ends_before_the_points(tmp_path):
     out = write_points(tmp_path / "a", [0.5, 0.6, 0.7, 200_000], [-0.5] * 4, [100.0] * 4)
-    with pytest.raises(SatIntervalsError, match=r"does not cover the points of .*: give one that covers them"):
+    with pytest.raises(SatIntervalsError, match=r"does not cover the region of .*: give one that covers them"):
         surface_of([out], tmp_path, geoid=write_geoid(tmp_path / "geoid.tif", 49.5))
 
 
@@ -452,7 +452,7 @@ def test_make_surface__what_it_cannot_use_gets_one_line(tmp_path):
         ([far[0]], ["--output", str(far[0] / "run.json")], "run.json exists: choose another name or --overwrite"),
         ([far[0]], ["--output", str(far[0] / "run.json"), "--overwrite"], "run.json is an input"),
         ([far[0]], ["--left-model", "a.tif"], "--right-grid go together: give all four"),
-        (far, sensor_words(["a.tif", "b.tif", "c.tif", "d.tif"]), "1 sets of models and grids for 2 OUT"),
+        (far, sensor_words(["a.tif", "b.tif", "c.tif", "d.tif"]), "models and grids are given 1 times for 2 OUT"),
         ([far[0]], ["--output", str(tmp_path)], "is a folder: choose another name"),
         ([far[0]], ["--geoid", str(write_geoid(tmp_path / "wild.tif", -9999.0))], "has -9999 m at longitude 1.39"),
         ([far[0]], ["--geoid", str(write_geoid(tmp_path / "a,@b.tif", 9.0))], "a,@b.tif: PROJ reads no file with a co"),

@@ -109,8 +109,9 @@ def test_guide__epipolar_images_and_grids_of_otb_fit_to_a_fraction_of_a_pixel(su
         assert errors[0.0][inner].mean() < min(errors[-0.1][inner].mean(), errors[0.1][inner].mean())
 
 
-def test_triangulate__heights_by_grids_of_otb_are_true(surfaced):
+def test_triangulate__heights_by_grids_of_otb_are_true(otb, surfaced):
     scene, folder = surfaced
+    otb([COMMAND, "triangulate", "out"], folder)
     with rasterio.open(folder / "out" / "points.tif") as points:
         longitude, latitude, height = points.read((1, 2, 3))
     found = np.isfinite(height)
