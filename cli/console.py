@@ -20,6 +20,7 @@ STAGES = {
     "levels": "matching at levels",
     "kernels": "preparing kernels (compiled once per machine, then about a second)",
     "range": "finding the search range",
+    "rows": "comparing rows",
     "images": "measuring images",
     "tiles": "matching tiles",
     "bands": "postprocessing rows",
@@ -119,6 +120,10 @@ class Console:
         width = counts["median_interval_width"]
         table.add_row("median interval width", "none" if width is None else f"{width:.2f} px")
         table.add_row("low confidence, of valid pixels", _share(counts["low_confidence"], counts["valid"]))
+        if report.get("rows"):
+            of_rows = report["survey"]["rows"]
+            moved = f"up to {of_rows['most']:.2f} px, {of_rows['after'][0]:.2f} px left"
+            table.add_row("rows of the right image moved", moved)
         table.add_row("time", f"{report['seconds']['total']:.1f} s")
         self._terminal.print(table)
         for name in ("intervals.tif", "validity.tif", "run.json"):

@@ -19,7 +19,7 @@ from sat_intervals.cli.logs import logged
 PRESETS = ("satellite", "satellite-mccnn", "paper", "mccnn")
 
 # Pictures that `plot` writes to the folder of a run, without their ending.
-PICTURES = ("overview", "errors", "coverage", "range", "profile", "curve", "dsm")
+PICTURES = ("overview", "errors", "coverage", "range", "rows", "profile", "curve", "dsm")
 
 Command = Callable[..., Any]
 Decorator = Callable[[Command], Command]

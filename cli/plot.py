@@ -54,7 +54,7 @@ def plot(
     from sat_intervals.show.dsm import draw_surface
     from sat_intervals.show.maps import draw_errors, draw_overview
     from sat_intervals.show.profile import draw_curve, draw_profile
-    from sat_intervals.show.search_range import draw_range, has_range
+    from sat_intervals.show.rows import before_tiles
 
     results = open_results(out, truth)
     is_judged = results.truth is not None and results.config.interval is not None
@@ -72,8 +72,7 @@ def plot(
     if is_judged:
         drawings["errors"] = lambda target: draw_errors(results, target, dpi)
         drawings["coverage"] = lambda target: draw_coverage([out, *beside], target, dpi, truth=truth, **judging)
-    if has_range(results):
-        drawings["range"] = lambda target: draw_range(results, target, dpi)
+    drawings |= before_tiles(results, dpi)
     if row is not None:
         drawings["profile"] = lambda target: draw_profile(results, target, row, columns, dpi)
     if pixel:

@@ -68,7 +68,10 @@ def _report(inputs, bands, validity):
         "counts": tally.report(),
         "search": None,
         "local_ranges": None,
-        "quality": {"noise": 0.41, "row_offset": None, "collars": {"left": {"value": 0.0, "share": 0.05}}},
+        "survey": None,
+        "surveyed": "",
+        "rows": None,
+        "quality": {"noise": 0.41, "collars": {"left": {"value": 0.0, "share": 0.05}}},
         "warnings": ["left.tif: 5 % of the pixels are exactly 0"],
         "validity_bits": {
             flag.name: {"bit": flag.bit, "meaning": flag.meaning, "invalid": flag.invalid} for flag in FLAGS

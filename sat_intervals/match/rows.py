@@ -13,13 +13,13 @@ from sat_intervals.match.sampling import Look, noise_of
 # Looks that a constant and a plane need, and each further degree per coefficient.
 _FEWEST, _PER_COEFFICIENT = 3, 4
 # Share of the residual that a further degree must take away.
-_BETTER = 0.8
+_BETTER = 0.7
 # Steps of the fit, and the least scale of its residuals in pixels: residuals of twice the scale count half.
 _STEPS, _SCALE = 30, 0.05
 # Pixels of offset from which on rows are taken out, and that are searched.
-TAKEN, _MOST = 0.3, 8.0
+TAKEN, _MOST = 0.3, 12.0
 # Pixels of residual that a smooth function should not leave in a quarter of the looks, or in half of them.
-JITTER, _CONTRADICTING = 0.3, 1.5
+JITTER, _CONTRADICTING = 0.3, 0.5
 
 
 @dataclass(frozen=True)

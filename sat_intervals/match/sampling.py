@@ -16,10 +16,12 @@ from sat_intervals.tiling import View, Window, facing
 
 # Side of a block, and blocks along each side of the image at most; side of its part that is matched at full resolution.
 _SIDE, _BLOCKS, _PART = 256, 5, 96
-# What a block is reduced by first, the pixels of a surface there, and the rows of the image that are read around it.
-_STEP, _SPECKLE, _MARGIN = Step(4, 4), 40, 20
+# What a block is reduced by first, the pixels of a surface there, and the rows of that level that are tried first.
+_STEP, _SPECKLE, _MOST = Step(4, 4), 40, 4
 # Rows up and down that are tried at a level, and the box over which costs are summed.
 _ROWS, _BOX = 2, 9
+# Side of the cells in which rows are tried first.
+_CELL = 8
 # Matches of a level and of a part that are needed at least.
 _FEWEST_COARSE, _FEWEST = 100, 500
 _CENSUS, _BITS = 5, 24
@@ -41,7 +43,7 @@ class Spot(NamedTuple):
     @property
     def views(self) -> tuple[Window, Window]:
         """Return the windows of both images that `look` needs."""
-        return self.left, facing(self.left, self.minimum, self.maximum).grown(_MARGIN, 0)
+        return self.left, facing(self.left, self.minimum, self.maximum).grown(_MOST * _STEP.rows, 0)
 
 
 class Look(NamedTuple):
@@ -69,8 +71,8 @@ def spots(region: Window, minimum: int, maximum: int) -> list[Spot]:
 
 
 def _starts(first: int, size: int) -> list[int]:
-    """Return where blocks begin along a side of a region; they share at most half of their pixels."""
-    number = min(_BLOCKS, max(1, 2 * size // _SIDE - 1))
+    """Return where blocks begin along a side of a region; they share at most three quarters of their pixels."""
+    number = min(_BLOCKS, max(1, 4 * size // _SIDE - 3))
     return [first + max(0, size - _SIDE) * i // max(1, number - 1) for i in range(number)]
 
 
@@ -101,25 +103,37 @@ def look(spot: Spot, left: View, right: View) -> Look | None:
 
 def _coarse(left: View, right: View) -> tuple[Matches, int] | None:
     """Return matches of a reduced block, and the rows of the image by which the right one lies lower there."""
-    here = reduced(left.pixels, left.state, _STEP)
-    rows = 0
-    for _ in range(2):
-        first = _MARGIN + rows
-        window = slice(first, first + left.window.height)
-        there = reduced(right.pixels[window], right.state[window], _STEP)
-        if 0 in here.shape or there.shape[1] < here.shape[1]:
-            return None
-        matches = match_level(here, there, (0, there.shape[1] - here.shape[1]), _SPECKLE)
-        if matches.kept.sum() < _FEWEST_COARSE:
-            return None
-        offsets = _coarse_offsets(here, there, matches)
-        if not offsets.size:
-            return None
-        more = float(np.median(offsets))
-        if abs(more) < 0.75:
-            return matches._replace(step=_STEP), rows + round(more * _STEP.rows)
-        rows = int(np.clip(rows + _STEP.rows * round(more), -_MARGIN + 4, _MARGIN - 4))
-    return matches._replace(step=_STEP), rows
+    here, there = (reduced(view.pixels, view.state, _STEP) for view in (left, right))
+    last = there.shape[1] - here.shape[1]
+    if min(here.shape) < _CELL or last < 0:
+        return None
+    rows = _likeliest_rows(here, there)
+    there = there[_MOST + rows : _MOST + rows + len(here)]
+    matches = match_level(here, there, (0, last), _SPECKLE)
+    offsets = _coarse_offsets(here, there, matches) if matches.kept.sum() >= _FEWEST_COARSE else np.empty(0)
+    if not offsets.size:
+        return None
+    return matches._replace(step=_STEP), round(_STEP.rows * (rows + float(np.median(offsets))))
+
+
+def _likeliest_rows(left: np.ndarray, right: np.ndarray) -> int:
+    """Return the rows of a level, whose right image has `_MOST` more at both ends, at which candidates fit best.
+
+    Each cell of some pixels has the candidate, one disparity for all, whose codes differ least.
+    """
+    margin = _CENSUS // 2
+    views = (_view(image) for image in (left, right))
+    here, there = (census(*cut(view, view.window.grown(margin, margin))[1:], _CENSUS) for view in views)
+    rows, columns = (size // _CELL * _CELL for size in left.shape)
+    words = np.lib.stride_tricks.sliding_window_view(there.words[0], columns, axis=1)
+    states = np.lib.stride_tricks.sliding_window_view(there.state, columns, axis=1)
+    fits = []
+    for row in range(2 * _MOST + 1):
+        differ = np.bitwise_count(here.words[0][:rows, np.newaxis, :columns] ^ words[row : row + rows])
+        differ[states[row : row + rows] != 0] = _BITS
+        cells = differ.reshape(rows // _CELL, _CELL, differ.shape[1], columns // _CELL, _CELL)
+        fits.append(cells.sum(axis=(1, 4), dtype=np.int64).min(axis=1).mean())
+    return int(np.argmin(fits)) - _MOST
 
 
 def _coarse_offsets(left: np.ndarray, right: np.ndarray, matches: Matches) -> np.ndarray:

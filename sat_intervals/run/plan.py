@@ -23,7 +23,7 @@ from sat_intervals.run import assemble
 from sat_intervals.run.checks import check_tiles, checked_pair, checked_region, fitted_to_jobs
 from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.pair import match_pair
-from sat_intervals.run.search_range import finder_here
+from sat_intervals.run.search_range import find_here
 from sat_intervals.run.workers import cores_of_process, is_remote, readers, reason, tiles_at_once
 from sat_intervals.store.tiles import store_bytes
 from sat_intervals.tiling import Grid, Window
@@ -65,8 +65,7 @@ def plan(
     """
     config = resolved(load_config(config))
     left, right = checked_pair(left, right, config)
-    with finder_here(progress) as finder:
-        config, _, _ = searched(config, left, lambda: finder.search_range(left, right))
+    config, _, _ = searched(config, left, lambda: find_here(left, right, progress))
     checked_pair(left, right, config)
     config = fitted_to_jobs(config) if memory is None else fitted(config, memory, waiting=readers(config.cluster))
     workers = workers or tiles_at_once(config.cluster)

@@ -67,9 +67,9 @@ class Finder:
     def survey(self, left: Image, right: Image, region: Window, search: tuple[int, int]) -> Survey:
         """Look at blocks of a region of the left image over a search range: noise and row offsets."""
         with logged_stage(self.seconds, "start.rows"):
-            compile_kernels(settings(0, 3))
+            compile_kernels(settings(0, 3), hands_states_on=False)
             chosen = [(left, right, spot) for spot in spots(region, *search)]
-            results = sorted(_results(self.workers, look_at, chosen, self.progress), key=itemgetter(0))
+            results = sorted(_results(self.workers, look_at, chosen, self.progress, "rows"), key=itemgetter(0))
             looks = [found for _, found in results if found is not None]
             try:
                 return surveyed(looks, right.height, right.width)
@@ -110,6 +110,12 @@ def finder_here(progress: Progress) -> Iterator[Finder]:
         yield Finder(connection, progress)
 
 
+def find_here(left: Image, right: Image, progress: Progress) -> Found:
+    """Find the search range of a pair with the cores of this machine."""
+    with finder_here(progress) as finder:
+        return finder.search_range(left, right)
+
+
 def _reduced(workers: Workers, image: Image, step: Step, progress: Progress) -> tuple[np.ndarray, float]:
     """An image at the finest level, and its smallest usable value."""
     windows = [
@@ -127,12 +133,16 @@ def _reduced(workers: Workers, image: Image, step: Step, progress: Progress) -> 
 
 
 def _results(
-    workers: Workers, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], progress: Progress
+    workers: Workers,
+    function: Callable[..., Any],
+    arguments: Sequence[tuple[Any, ...]],
+    progress: Progress,
+    stage: str = "range",
 ) -> Iterator[tuple[int, Any]]:
     """Yield results of a function on workers, by the number of its arguments."""
     tasks = (Task(i, function, each, _RETRIES) for i, each in enumerate(arguments))
-    return results(workers, tasks, _failed, lambda done: progress("range", done, len(arguments)))
+    return results(workers, tasks, _failed, lambda done: progress(stage, done, len(arguments)))
 
 
 def _failed(_: int, error: BaseException) -> NoReturn:
-    raise RunError(f"the search range could not be found: {reason(error)}") from error
+    raise RunError(f"search range and rows could not be found: {reason(error)}") from error

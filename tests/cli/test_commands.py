@@ -187,7 +187,7 @@ def test_match__refuses_options_that_do_not_suit_the_pair(folder, tmp_path, opti
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("sgn: {p1: 8}", "unknown key 'sgn', did you mean sgm? (known: preset, disparity, cost, sgm, "),
+        ("sgn: {p1: 8}", "unknown key 'sgn', did you mean sgm? (known: preset, disparity, rows, cost, sgm, "),
         ("sgm: {p3: 8}", "unknown key 'sgm.p3' (known: penalty, p1, p2, span)"),
         ("sgm: {p1: eight}", "sgm.p1 is 'eight', allowed: number > 0"),
         ("sgm: {p1: 140}", "sgm: p1 140 is above p2 128"),
@@ -573,7 +573,7 @@ def test_match__prints_plain_lines_and_a_table(done):
     assert (result.exit_code, result.stderr) == (0, "")
     assert "\x1b" not in result.stdout
     lines = result.stdout.splitlines()
-    assert lines[0].startswith("preparing kernels")
+    assert lines[0].startswith("comparing rows")
     assert any(re.fullmatch(r"matching tiles: \d+/20, (\d+/s|\d+ s each), \d+ s left", line) for line in lines)
     assert "matching tiles: 20/20" in lines
     assert "postprocessing rows: 200/200" in lines

@@ -65,7 +65,8 @@ def test_load_config__completes_with_the_defaults() -> None:
 def test_default_yaml__holds_every_setting_at_its_default() -> None:
     values = yaml.safe_load(preset_text())
     assert list(values) == list(Config.model_fields)
-    assert values.pop("preset") == settings().preset
+    for name in ("preset", "rows"):
+        assert values.pop(name) == getattr(settings(), name)
     for section, keys in values.items():
         model = getattr(settings(), section)
         assert list(keys) == list(type(model).model_fields)
@@ -80,15 +81,18 @@ def test_preset_text__comments_every_setting_with_its_meaning_and_range(name: st
     for line in preset_text(name).splitlines():
         if found := re.fullmatch(r"(\w+):", line):
             section = type(getattr(config, found[1]))
-        elif found := re.fullmatch(r"(?:  |(?=preset))(\w+): \S+ +# (.*)", line):
-            section = section or Config
+        elif found := re.fullmatch(r"(?:  |(?=preset|rows))(\w+): \S+ +# (.*)", line):
+            section = section if line.startswith(" ") else Config
             field = section.model_fields[found[1]]
             assert found[2] == f"{field.description} ({allowed(field)})"
             commented.append((section, found[1]))
         else:
             assert not line or line.startswith("#")
-    models = [type(getattr(config, name)) for name in Config.model_fields if name != "preset"]
-    assert commented == [(Config, "preset"), *((model, key) for model in models for key in model.model_fields)]
+    expected = []
+    for name in Config.model_fields:
+        model = type(getattr(config, name))
+        expected += [(Config, name)] if model is str else [(model, key) for key in model.model_fields]
+    assert commented == expected
 
 
 def test_preset_text__mccnn_holds_the_defaults_of_its_cost() -> None:
@@ -308,12 +312,12 @@ REFUSED = [
     (
         "regularisation",
         {},
-        "unknown key 'regularisation', did you mean regularization? (known: preset, disparity, cost",
+        "unknown key 'regularisation', did you mean regularization? (known: preset, disparity, rows, cost",
     ),
     ("preset", "papr", "preset is 'papr', allowed: satellite or satellite-mccnn or paper or mccnn"),
     ("preset", ["paper"], "preset is ['paper'], allowed: satellite or"),
     ("sgm", {"p2": 40, "span": 9}, "sgm.span is given, but with cost.method census it follows from p2: leave it out"),
-    (7, {}, "unknown key '7' (known: preset, disparity, cost, sgm"),
+    (7, {}, "unknown key '7' (known: preset, disparity, rows, cost, sgm"),
 ]
 
 
@@ -372,8 +376,8 @@ def test_config_error__is_of_the_family() -> None:
         ("sgm: !!python/name:os.system\n", "line 1: could not determine a constructor"),
         ("sgm: *nowhere\n", "line 1: found undefined alias"),
         ("[1, 2]: 3\n", "line 1: found unhashable key"),
-        ("- disparity\n", "holds ['disparity'], allowed: sections preset, disparity, cost"),
-        ("paper", "holds 'paper', allowed: sections preset, disparity, cost"),
+        ("- disparity\n", "holds ['disparity'], allowed: sections preset, disparity, rows, cost"),
+        ("paper", "holds 'paper', allowed: sections preset, disparity, rows, cost"),
         ("sgm: {p1: 2024-13-45}\n", "month must be in 1..12"),
         (b"II*\x00\x08\x00\x00\x00", "unacceptable character"),
         (b"sgm: \xff\n", "unacceptable character"),

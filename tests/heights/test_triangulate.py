@@ -4,6 +4,7 @@ import csv
 import json
 import shutil
 from contextlib import suppress
+from dataclasses import asdict
 from xml.etree.ElementTree import Element, ElementTree, SubElement
 
 import numpy as np
@@ -19,6 +20,7 @@ from rasterio.warp import reproject
 from sat_intervals import SatIntervalsError, match_pair
 from sat_intervals.demo import DATUM, PIXEL, VIEWS, make_scene
 from sat_intervals.heights.dsm import make_surface
+from sat_intervals.kernels.rows import RowOffsets
 from sat_intervals.products import INVALID, POINTS
 from sat_intervals.raster import Projection
 from sat_intervals.results import open_run
@@ -477,6 +479,32 @@ def test_dsm_command__remembers_models_and_grids_in_the_folder(level_run, tmp_pa
     (out / "run.json").write_text(json.dumps(report))
     other = invoke("dsm", out, "--resolution", 1)
     assert (other.exit_code, "geometry.json is of other images" in other.stderr) == (2, True)
+
+
+def test_dsm_command__points_are_those_of_the_rows_that_were_matched(level_run, tmp_path):
+    out, files = level_run
+    expected = [tmp_path / "expected.tif", tmp_path / "found.tif"]
+    assert invoke("triangulate", out, *sensor_words(files), "--output", expected[0]).exit_code == 0
+    # the right grid lies lower by a plane, and the run took its rows out
+    lower = RowOffsets((0.6, 0.3, -0.2), 40, 50)
+    moved = tmp_path / "moved.tif"
+    with rasterio.open(files[3]) as file, rasterio.open(moved, "w", **file.profile) as other:
+        positions, place = file.read(), file.transform
+        column, row = np.meshgrid(*(place.c + place.a * (np.arange(size) + 0.5) for size in (file.width, file.height)))
+        positions[1] -= lower.at(row, column)
+        other.write(positions)
+    report = json.loads((out / "run.json").read_text())
+    words = sensor_words([*files[:3], moved])
+    wrong = invoke("triangulate", out, *words, "--output", tmp_path / "wrong.tif")
+    assert "warning" in wrong.stderr
+    (out / "run.json").write_text(json.dumps(report | {"rows": asdict(lower)}))
+    result = invoke("triangulate", out, *words, "--output", expected[1])
+    assert (result.exit_code, result.stderr) == (0, "")
+    one, other = map(read, expected)
+    pixel = 0.02 * PIXEL
+    assert np.abs(one[2:5] - other[2:5]).max() < pixel
+    assert (np.abs(one[0] - other[0]) * EAST).max() < pixel
+    assert (np.abs(one[1] - other[1]) * NORTH).max() < pixel
 
 
 def test_dsm_command__of_two_runs_takes_the_models_and_grids_of_each(level_run, tmp_path):

@@ -25,7 +25,7 @@ from sat_intervals.match.matching_cost import Area, cost_areas, view_windows
 from sat_intervals.match.mccnn import Network, load_network
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
 from sat_intervals.match.patch import kernel_settings
-from sat_intervals.match.whole import _view
+from sat_intervals.match.whole import cut, whole_view
 from sat_intervals.products import COSINE_STEPS, IMPOSSIBLE_COST, INVALID
 from sat_intervals.raster import open_image
 from sat_intervals.results import open_results
@@ -151,7 +151,7 @@ def test_network__no_network_is_refused(tmp_path):
 
 # ---- Costs and penalties -----------------------------------------------------------------------------------
 def costs_of(left, right, areas, config, statistics):
-    views = tuple(map(_view, (left, right), view_windows(areas, config)))
+    views = tuple(map(cut, map(whole_view, (left, right)), view_windows(areas, config)))
     return cost_areas(views, areas, config, statistics)
 
 
@@ -166,7 +166,7 @@ def test_compare__costs_equal_reference(network_file, weights, mirrored):
     volume = cost_volume(found.costs, kernel_settings(config))
 
     def features(image, statistics, window):
-        _, pixels, state = _view(image, window.grown(5, 5))
+        _, pixels, state = cut(whole_view(image), window.grown(5, 5))
         pixels = np.where(state == 0, (pixels - statistics.mean) / statistics.deviation, 0)
         return slow_features(weights, pixels), reference.window_state(state, 11)
 
@@ -303,7 +303,7 @@ def test_match_pair__an_image_that_cannot_be_measured_fails_the_run(tmp_path, ne
     left, right = masked_images(70, 140)
     images = write(tmp_path / "left.tif", left), write(tmp_path / "right.tif", right)
     images[1].write_bytes(images[1].read_bytes()[:-4000])
-    with pytest.raises(RunError, match=r"right\.tif could not be measured: .*the file may be truncated"):
+    with pytest.raises(RunError, match=r"right\.tif cannot be read at .*the file may be truncated"):
         match_pair(*images, tmp_path / "out", settings(-4, 6, network_file))
 
 
@@ -350,7 +350,7 @@ def test_match_batch__measures_each_pair_and_goes_on_after_one_that_it_cannot(tm
     cost = {"preset": "mccnn", "cost": {"weights": str(network_file)}}
     report = match_batch(pairs, tmp_path / "out", cost)
     assert {name: end["state"] for name, end in report.items()} == {"broken": "failed", "whole": "done"}
-    assert "cut.tif could not be measured" in report["broken"]["error"]
+    assert "cut.tif cannot be read at" in report["broken"]["error"]
     match_pair(tmp_path / "left.tif", tmp_path / "right.tif", tmp_path / "alone", SEARCH | cost)
     for one, other in zip(bands(tmp_path / "out" / "whole"), bands(tmp_path / "alone"), strict=True):
         np.testing.assert_array_equal(one, other)

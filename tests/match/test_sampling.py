@@ -1,48 +1,54 @@
-"""Noise and row offset of a pair, measured in sample windows."""
+"""Looks at blocks of a pair: noise and row offsets."""
 
 import numpy as np
 import pytest
 
 from sat_intervals.demo import make_scene
-from sat_intervals.match.sampling import coarse_rows, look_in_tile, summary
-from sat_intervals.match.search_range import Step, find_range, reduced
-from sat_intervals.tiling import View, Window
+from sat_intervals.match.sampling import look, noise_of, spots
+from sat_intervals.match.whole import cut, whole_view
+from sat_intervals.tiling import Window
 
 
 @pytest.fixture(scope="module")
 def scene():
-    return make_scene(260, 360, seed=3)
+    return make_scene(420, 480, seed=3)
 
 
-def view(image):
-    return View(Window(0, 0, *image.shape), image.astype(np.float32), (image == 0).view(np.uint8))
+def looks_at(left, right, scene):
+    views = [whole_view(np.ma.masked_equal(image, 0).astype(np.float32)) for image in (left, right)]
+    chosen = spots(views[0].window, scene.minimum, scene.maximum)
+    found = (look(spot, *map(cut, views, spot.views)) for spot in chosen)
+    return [one for one in found if one is not None]
 
 
-def quality(left, right, scene):
-    core = Window(0, 0, *left.shape)
-    return summary(look_in_tile((view(left), view(right)), core, scene.minimum, scene.maximum))
+@pytest.mark.parametrize("rows", [0, 1, 3, 6, -5])
+def test_look__measures_the_rows_by_which_the_right_image_lies_lower(scene, rows):
+    height = len(scene.left) - abs(rows)
+    left = scene.left[max(0, rows) : max(0, rows) + height]
+    right = scene.right[max(0, -rows) : max(0, -rows) + height]
+    offsets = [one.rows for one in looks_at(left, right, scene)]
+    assert len(offsets) >= 2
+    assert abs(np.median(offsets) - rows) < 0.05
 
 
-def test_look_in_tile__measures_the_rows_by_which_the_right_image_lies_lower(scene):
-    assert abs(quality(scene.left, scene.right, scene)["row_offset"]) < 0.2
-    assert quality(scene.left[2:], scene.right[:-2], scene)["row_offset"] == pytest.approx(2, abs=0.2)
-    assert quality(scene.left[:-2], scene.right[2:], scene)["row_offset"] == pytest.approx(-2, abs=0.2)
-
-
-def test_look_in_tile__noise_makes_matches_differ_more(scene):
+def test_noise_of__noise_makes_matches_differ_more(scene):
     random = np.random.default_rng(0)
     noisy = [image + random.integers(0, 60, image.shape) * (image > 0) for image in (scene.left, scene.right)]
-    clean, worse = quality(scene.left, scene.right, scene)["noise"], quality(*noisy, scene)["noise"]
+    clean, worse = noise_of(looks_at(scene.left, scene.right, scene)), noise_of(looks_at(*noisy, scene))
     assert clean < worse < 0.9
 
 
-def test_look_in_tile__tells_nothing_of_empty_images(scene):
+def test_look__sees_nothing_in_empty_images(scene):
     nothing = np.zeros_like(scene.left)
-    assert quality(nothing, nothing, scene) == {"noise": None, "row_offset": None}
+    assert looks_at(nothing, nothing, scene) == []
+    assert noise_of([]) is None
 
 
-def test_coarse_rows__sees_an_offset_of_a_coarse_pixel(scene):
-    step = Step(2, 2)
-    left, right = (reduced(v.pixels, v.state, step) for v in map(view, (scene.left[2:], scene.right[:-2])))
-    matches = find_range(left, right, step, (258, 360))[1]
-    assert coarse_rows(left, right, matches) == pytest.approx(2, abs=0.6)
+def test_spots__cover_a_region_and_stay_inside():
+    for height, width, number in ((100, 700, 5), (256, 256, 1), (5000, 5000, 25)):
+        region = Window(30, 40, height, width)
+        chosen = spots(region, -5, 9)
+        assert len(chosen) == number
+        assert all(spot.left.clipped(region) == spot.left for spot in chosen)
+        assert chosen[0].left.row == 30
+        assert chosen[-1].left.column_stop == 40 + width

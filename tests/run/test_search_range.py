@@ -18,6 +18,7 @@ from sat_intervals.results import open_results
 from sat_intervals.run import pair as run_pair
 from sat_intervals.run.local_ranges import read_ranges
 from sat_intervals.run.pair import prepare
+from sat_intervals.run.search_range import Finder
 from sat_intervals.show.report.contents import Pixels
 
 
@@ -50,7 +51,8 @@ def test_match_pair__an_interrupted_run_keeps_its_range(folder, tmp_path, monkey
     with np.load(tmp_path / "tiles/once/range.npz") as kept:
         stored = json.loads(kept["meta"])["found"]
     monkeypatch.undo()
-    monkeypatch.setattr(run_pair, "search_range", lambda *_: pytest.fail("searched again"))
+    for name in ("search_range", "survey"):
+        monkeypatch.setattr(Finder, name, lambda *_: pytest.fail("searched again"))
     report = run(folder, tmp_path)
     assert report["search"]["minimum"] == stored["minimum"]
     assert not (tmp_path / "tiles").exists()
@@ -69,7 +71,7 @@ def test_match_pair__takes_no_range_of_other_images(folder, tmp_path, monkeypatc
     def search(*_):
         raise RunError("searched again")
 
-    monkeypatch.setattr(run_pair, "search_range", search)
+    monkeypatch.setattr(Finder, "search_range", search)
     with pytest.raises(RunError, match="searched again"):
         match_pair(folder / "right.tif", folder / "left.tif", tmp_path, {})
 

@@ -132,7 +132,7 @@ def test_assemble__copies_parts_with_workers_that_reach_the_folder(tall, tmp_pat
     cluster = {"store": str(tmp_path / store)} if store else {}
     done = []
     matched(tall, tmp_path / "out", cluster=cluster | {"workers": 3}, progress=lambda *how: done.append(how))
-    copied = [count for count, label in threads if isinstance(label[-1], str)]
+    copied = [count for count, label in threads if isinstance(label, tuple) and isinstance(label[-1], str)]
     assert copied == 2 * PARTS * [2 if store else 3]
     assert [how for how in done if how[0] == "files"] == [("files", n, 2 * PARTS) for n in range(2 * PARTS + 1)]
     assert hashes(tmp_path / "out") == hashes(tall[0] / "kept")

@@ -56,6 +56,15 @@ def _contents(results: Results) -> dict[str, Any]:
     }
 
 
+def _rows(run: Mapping[str, Any]) -> dict[str, str]:
+    """Return what the rows of the two images differ by, if they were compared."""
+    found = (run.get("survey") or {}).get("rows")
+    if not found:
+        return {}
+    left = f", taken out up to {found['after'][0]:.2f} px" if run.get("rows") else ""
+    return {"rows of the two images differ by": f"{found['before'][0]:.2f} px in the median{left}"}
+
+
 def _summary(contents: Mapping[str, Any]) -> str:
     """Return the main figures of a run as rows of an HTML table, for browsers without scripts."""
     run, counts = contents["run"], contents["run"]["counts"]
@@ -64,6 +73,7 @@ def _summary(contents: Mapping[str, Any]) -> str:
         "left image": run["inputs"]["left"]["path"],
         "size": f"{region['height']} x {region['width']} pixels",
         "search range": f"{search['minimum']} to {search['maximum']} px",
+        **_rows(run),
         "median interval width": "none" if width is None else f"{width} px",
     }
     for kind, count in zip(PIXEL_CLASSES, contents["classes"], strict=True):

@@ -1,0 +1,54 @@
+"""Row offsets fitted to looks at blocks of a pair."""
+
+import numpy as np
+import pytest
+
+from sat_intervals import SatIntervalsError
+from sat_intervals.match.rows import RowFit, Survey, fit_rows
+from sat_intervals.match.sampling import Look
+
+
+def looks_at(function, count=25, side=1000, wrong=0, noise=0.0, seed=0):
+    """Looks spread over an image, at offsets of a function of row and column; some are wrong by pixels."""
+    random = np.random.default_rng(seed)
+    row, column = np.mgrid[0 : side - 1 : 5j, 0 : side - 1 : 5j].reshape(2, -1)[:, :count]
+    offset = function(row, column) + noise * random.normal(size=row.size)
+    offset[random.permutation(row.size)[:wrong]] += 3
+    return [Look(r, c, 1000, 5.0, 12.0, float(rows)) for r, c, rows in zip(row, column, offset, strict=True)]
+
+
+def test_fit_rows__finds_a_plane_beside_wrong_looks():
+    fit = fit_rows(looks_at(lambda r, c: 2 + 0.001 * r - 0.0005 * c, wrong=4, noise=0.02), 1000, 1000)
+    assert len(fit.offsets.coefficients) == 3
+    for row, column in ((0, 0), (0, 999), (999, 0), (999, 999)):
+        assert abs(fit.offsets.at(np.array(row), np.array(column)) - (2 + 0.001 * row - 0.0005 * column)) < 0.05
+    assert fit.most == pytest.approx(3.0, abs=0.05)
+    assert fit.matches == 25_000
+    assert not fit.has_jitter
+    assert RowFit.of_report(fit.report()) == fit
+
+
+def test_fit_rows__takes_the_lowest_degree_that_explains_the_looks():
+    assert len(fit_rows(looks_at(lambda r, c: 1 + 0 * r, noise=0.02), 1000, 1000).offsets.coefficients) == 1
+    bent = fit_rows(looks_at(lambda r, c: 4e-6 * (r - 500) ** 2, noise=0.01), 1000, 1000)
+    assert len(bent.offsets.coefficients) == 6
+
+
+def test_fit_rows__rows_that_jump_are_jitter():
+    fit = fit_rows(looks_at(lambda r, c: np.where((r // 200) % 2 == 0, 0.4, -0.4)), 1000, 1000)
+    assert fit.has_jitter
+
+
+def test_fit_rows__refuses_pairs_that_are_not_epipolar():
+    random = np.random.default_rng(1)
+    for function in (lambda r, c: random.uniform(-8, 8, r.shape), lambda r, c: 14 + 0 * r):
+        with pytest.raises(SatIntervalsError, match=r"not an epipolar pair: rows differ by .* px in the median"):
+            fit_rows(looks_at(function), 1000, 1000)
+
+
+def test_survey__takes_out_what_is_large_enough():
+    for size, taken in ((0.2, False), (0.5, True)):
+        fit = fit_rows(looks_at(lambda r, c, size=size: size + 0 * r), 1000, 1000)
+        assert (Survey(0.4, fit).taken is not None) == taken
+    assert Survey(None, None).taken is None
+    assert fit_rows(looks_at(lambda r, c: 0 * r, count=2), 1000, 1000) is None
