@@ -54,7 +54,7 @@ def plot(
     from sat_intervals.show.dsm import draw_surface
     from sat_intervals.show.maps import draw_errors, draw_overview
     from sat_intervals.show.profile import draw_curve, draw_profile
-    from sat_intervals.show.rows import before_tiles
+    from sat_intervals.show.search_range import draw_range, draw_rows, has_range, has_rows
 
     results = open_results(out, truth)
     is_judged = results.truth is not None and results.config.interval is not None
@@ -63,19 +63,20 @@ def plot(
     check_one_pair([out, *beside])
     if columns is not None and row is None:
         raise SatIntervalsError(f"--columns {columns[0]} {columns[1]} belong to a profile: give --row too")
-    if row is not None:
-        results.check_part(row, columns)
-    if pixel:
-        results.check_pixel(*pixel)
     results.check_kept([out / f"{name}.png" for name in PICTURES], [truth, judging["mask"], out / "dsm.tif"])
     drawings: dict[str, Callable[[Path], None]] = {"overview": lambda target: draw_overview(results, target, dpi)}
     if is_judged:
         drawings["errors"] = lambda target: draw_errors(results, target, dpi)
         drawings["coverage"] = lambda target: draw_coverage([out, *beside], target, dpi, truth=truth, **judging)
-    drawings |= before_tiles(results, dpi)
+    if has_range(results):
+        drawings["range"] = lambda target: draw_range(results, target, dpi)
+    if has_rows(results):
+        drawings["rows"] = lambda target: draw_rows(results, target, dpi)
     if row is not None:
+        results.check_part(row, columns)
         drawings["profile"] = lambda target: draw_profile(results, target, row, columns, dpi)
     if pixel:
+        results.check_pixel(*pixel)
         drawings["curve"] = lambda target: draw_curve(results, target, *pixel, dpi)
     if results.has_current("dsm.tif"):
         drawings["dsm"] = lambda target: draw_surface(out / "dsm.tif", target, dpi)

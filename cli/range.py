@@ -73,11 +73,17 @@ def _survey(survey: Any) -> list[tuple[str, str]]:
     rows = []
     if survey.noise is not None:
         rows.append(("distance of matches", f"{survey.noise:.2f} of that of random pixels"))
-    if found := survey.rows:
-        for name, (median, most) in (("the two images", found.before), ("a smooth function", found.after)):
-            rows.append((f"rows of {name} differ by", f"{median:.2f} px, 90 % at most {most:.2f} px"))
-        does = "is taken out by match" if survey.taken else "is left as it is"
-        rows.append(("  which", f"has up to {found.most:.2f} px, of {found.matches} matches, and {does}"))
+    found = survey.rows
+    if found is None:
+        rows.append(("rows of the two images", "not compared: too few matches"))
+    else:
+        for name, (median, most) in (
+            ("rows of the two images", found.before),
+            ("  from a smooth function", found.after),
+        ):
+            rows.append((name, f"differ by {median:.2f} px, 90 % at most {most:.2f} px"))
+        does = "taken out with rows auto" if survey.is_large and not found.contradiction else "left as they are"
+        rows.append(("  its largest", f"{found.most:.2f} px, of {found.matches} matches; {does}"))
     return rows
 
 

@@ -69,7 +69,6 @@ def _report(inputs, bands, validity):
         "search": None,
         "local_ranges": None,
         "survey": None,
-        "surveyed": "",
         "rows": None,
         "quality": {"noise": 0.41, "collars": {"left": {"value": 0.0, "share": 0.05}}},
         "warnings": ["left.tif: 5 % of the pixels are exactly 0"],

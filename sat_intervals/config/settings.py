@@ -41,7 +41,7 @@ class Config(Section):
     preset: Literal[PRESETS] = Field(PRESETS[0], description="settings for all keys that are not given")  # type: ignore[valid-type]
     disparity: Disparity = Disparity()
     rows: Literal["auto", "none"] = Field(
-        "auto", description="row offsets of the right image: found and taken out, or none is"
+        "auto", description="row offsets of the right image: measured and taken out, or left"
     )
     cost: Census | Mccnn = Field(Census(), discriminator="method")
     sgm: AnySgm | None = Sgm()

@@ -19,7 +19,7 @@ BEFORE, AFTER = 1, 2
 
 @dataclass(frozen=True)
 class RowOffsets:
-    """Rows by which the right image lies lower, at places of an image of so many rows and columns.
+    """Rows by which the right image lies lower, at rows of the left image and columns of the right one, of this size.
 
     ``coefficients`` are those of ``1, v, u, v^2, v u, u^2, v^3, ...``, in pixels.
     """
@@ -34,16 +34,18 @@ class RowOffsets:
         return cls(tuple(report["coefficients"]), report["rows"], report["columns"])
 
     def at(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-        """Return the offsets in pixels at places of the right image, arrays that broadcast; centres are integers."""
+        """Return the offsets in pixels at rows of the left and columns of the right image; centres are integers."""
         v, u = self._scaled(row, column)
         return np.asarray(sum(k * term for k, term in zip(self.coefficients, _terms(v, u), strict=False)))
 
-    def read(self, row: int, column: int, rows: int, columns: int) -> tuple[int, int, np.ndarray]:
-        """Return the first row and the number of rows that a window is made of, and the offsets for `shift_rows`."""
+    def read(self, row: int, column: int, rows: int, columns: int) -> tuple[int, int, np.ndarray, np.ndarray]:
+        """Return the first row and the number of rows that a window is made of, and the arguments of `shift_rows`."""
         offset = self.at(np.arange(row, row + rows)[:, np.newaxis], np.arange(column, column + columns))
-        offset = np.broadcast_to(offset, (rows, columns))
-        first, last = int(np.floor(offset.min())) - BEFORE, int(np.floor(offset.max())) + AFTER
-        return row + first, rows + last - first, offset - first
+        whole = np.broadcast_to(np.floor(offset), (rows, columns))
+        first, last = int(whole.min()) - BEFORE, int(whole.max()) + AFTER
+        # the part first: with `first` subtracted before, it would depend on the window in its last bits
+        part = np.broadcast_to(offset - np.floor(offset), (rows, columns))
+        return row + first, rows + last - first, (whole - first).astype(np.int64), part
 
     def _scaled(self, row: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         half = max(self.rows, self.columns) / 2
@@ -74,24 +76,24 @@ def _weights(t):
 
 
 @cached
-def shift_rows(pixels, state, offset):
+def shift_rows(pixels, state, whole, part):
     """Read an image at rows moved by an offset; a pixel is usable if the pixels that it is made of are.
 
-    pixels, state: ``(rows + n, columns)``, float and uint8; row 0 is that of the result, moved by ``first``.
-    offset: ``(rows, columns)`` float64: rows from the result's row to the position in ``pixels``, from BEFORE on.
+    pixels, state: ``(rows + n, columns)``, float and uint8.
+    whole, part: ``(rows, columns)`` int64 and float64: rows from the result's row to the position in ``pixels``, from
+        BEFORE on, and part of a pixel beyond.
     Returns pixels of the same type and states ``(rows, columns)``; pixels are 0 where not usable.
     """
-    rows, columns = offset.shape
+    rows, columns = whole.shape
     result, states = np.zeros((rows, columns), pixels.dtype), np.zeros((rows, columns), np.uint8)
     for r in range(rows):
         for c in range(columns):
-            first = int(np.floor(offset[r, c]))
-            weights, _ = _weights(offset[r, c] - first)
+            weights, _ = _weights(part[r, c])
             value = 0.0
             for k in range(4):
                 if weights[k] != 0:
-                    value += weights[k] * pixels[r + first + k - BEFORE, c]
-                    states[r, c] |= state[r + first + k - BEFORE, c]
+                    value += weights[k] * pixels[r + whole[r, c] + k - BEFORE, c]
+                    states[r, c] |= state[r + whole[r, c] + k - BEFORE, c]
             if states[r, c] == 0:
                 result[r, c] = value
     return result, states

@@ -1,7 +1,9 @@
 """Matching of two arrays in memory as one tile, without files, store or scheduler."""
 
+import json
 import logging
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -9,10 +11,10 @@ import xarray as xr
 
 from sat_intervals.config import Config, load_config, resolved, unreached
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.kernels.rows import shift_rows
+from sat_intervals.kernels.rows import RowOffsets, shift_rows
 from sat_intervals.match.memory import check_memory, volume_bytes
 from sat_intervals.match.normalization import Moments, PairStatistics, blocks, moments, statistics_of
-from sat_intervals.match.rows import surveyed
+from sat_intervals.match.rows import Survey
 from sat_intervals.match.sampling import look, spots
 from sat_intervals.match.search_range import Found, NoRangeError, find_range, finest_step, reduced, with_range
 from sat_intervals.match.whole import cut, match_whole, whole_view
@@ -30,7 +32,8 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
     Parameters
     ----------
     left, right
-        ``(rows, columns)`` real numbers; the rows correspond, the numbers of columns may differ. NaN, infinity and
+        ``(rows, columns)`` real numbers; the numbers of columns may differ. Rows correspond, or are made to, see
+        the setting ``rows``. NaN, infinity and
         the masked pixels of a masked array are no data.
     config
         Settings, or a mapping as `load_config` takes it; ``tiles`` has no effect. A search range that is auto is found
@@ -40,7 +43,8 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
     -------
     Dataset
         ``disparity``, ``lower``, ``upper`` (pixels), ``confidence`` (0 to 1), float32, and ``validity``, uint16
-        flags; with the dimensions and coordinates of a left DataArray.
+        flags; with the dimensions and coordinates of a left DataArray. The attribute ``rows`` has the row offsets that
+        were taken out of the right image, as JSON.
 
     Raises
     ------
@@ -62,14 +66,16 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
             ranges = found.local.clipped(config.disparity.minimum, config.disparity.maximum)
     _check_fit(*pixels, config)
     images = _image(pixels[0]), _image(pixels[1])
+    rows = None
     if config.rows == "auto":
-        images = images[0], _with_rows(*images, config)
+        right_image, rows = _with_rows(*images, config)
+        images = images[0], right_image
     statistics = None
     if config.cost.needs_statistics:
         statistics = PairStatistics(*(statistics_of(_moments(image)) for image in images))
     final = match_whole(*images, config, statistics, ranges)
     labels = left if isinstance(left, xr.DataArray) else xr.DataArray(images[0], dims=("row", "column"))
-    dataset = xr.Dataset(coords=labels.coords)
+    dataset = xr.Dataset(coords=labels.coords, attrs={"rows": json.dumps(asdict(rows))} if rows else {})
     for band, layer in zip(BANDS, final[:4], strict=True):
         attributes = {"long_name": band.meaning} | ({"units": band.unit} if band.unit else {})
         dataset[band.name] = xr.DataArray(layer, dims=labels.dims, attrs=attributes)
@@ -112,18 +118,21 @@ def _found(left: np.ma.MaskedArray, right: np.ma.MaskedArray) -> Found:
         ) from None
 
 
-def _with_rows(left: np.ma.MaskedArray, right: np.ma.MaskedArray, config: Config) -> np.ma.MaskedArray:
-    """Return the right image at the rows of the left one; itself if they correspond."""
+def _with_rows(
+    left: np.ma.MaskedArray, right: np.ma.MaskedArray, config: Config
+) -> tuple[np.ma.MaskedArray, RowOffsets | None]:
+    """Return the right image at the rows of the left one, itself if they correspond, and the offsets taken out."""
     views = whole_view(left), whole_view(right)
     chosen = spots(Window(0, 0, *left.shape), config.disparity.minimum, config.disparity.maximum)
     found = (look(spot, *map(cut, views, spot.views)) for spot in chosen)
-    rows = surveyed([one for one in found if one], *right.shape).taken
+    search = config.disparity.minimum, config.disparity.maximum
+    rows = Survey.of_looks(views[0].window, search, [one for one in found if one], right.shape).taken(config.rows)
     if rows is None:
-        return right
-    first, count, offset = rows.read(0, 0, *right.shape)
+        return right, None
+    first, count, *places = rows.read(0, 0, *right.shape)
     wider = cut(views[1], Window(first, 0, count, right.shape[1]))
-    pixels, state = shift_rows(wider.pixels, wider.state, offset)
-    return np.ma.array(pixels, mask=state != 0)
+    pixels, state = shift_rows(wider.pixels, wider.state, *places)
+    return np.ma.array(pixels, mask=state != 0), rows
 
 
 def _check_rows(left: np.ndarray, right: np.ndarray) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.rows import RowOffsets
 from sat_intervals.match.sampling import Look, noise_of
+from sat_intervals.tiling import Window
 
 # Looks that a constant and a plane need, and each further degree per coefficient.
 _FEWEST, _PER_COEFFICIENT = 3, 4
@@ -18,6 +19,8 @@ _BETTER = 0.7
 _STEPS, _SCALE = 30, 0.05
 # Pixels of offset from which on rows are taken out, and that are searched.
 TAKEN, _MOST = 0.3, 12.0
+# Pixels from the middle of a look to the rim of its block.
+_HALF = 128
 # Pixels of residual that a smooth function should not leave in a quarter of the looks, or in half of them.
 JITTER, _CONTRADICTING = 0.3, 0.5
 
@@ -38,7 +41,8 @@ class RowFit:
         Median and 90 % quantile of the sizes of offsets of the looks, and of what the function leaves of them, each
         fitted to the other half of the looks, in pixels.
     looks
-        Row, column (of the right image), offset, and what the function leaves of it, in pixels, of each look.
+        Row, column of the right image, offset, and what the function, fitted to the other half, leaves of it, in
+        pixels, of each look.
     """
 
     offsets: RowOffsets
@@ -52,6 +56,17 @@ class RowFit:
     def has_jitter(self) -> bool:
         """Return whether offsets are not smooth: detector joins, or oscillations of the satellite."""
         return bool(np.quantile([abs(look[3]) for look in self.looks], 0.75) > JITTER)
+
+    @property
+    def contradiction(self) -> str | None:
+        """Return why the pair is not epipolar: offsets are larger than is searched, or contradict each other."""
+        before, after = self.before[0], self.after[0]
+        if before <= _MOST and self.most <= 2 * _MOST and after <= _CONTRADICTING:
+            return None
+        return (
+            f"not an epipolar pair: rows differ by {before:.1f} px in the median, up to {self.most:.1f} px, and by "
+            f"{after:.1f} px from a smooth function, over {self.matches} matches; {_MOST:g} px are searched"
+        )
 
     def report(self) -> dict[str, Any]:
         """Return the mapping that run.json holds."""
@@ -67,37 +82,52 @@ class RowFit:
 
 @dataclass(frozen=True)
 class Survey:
-    """What looks at blocks tell of a pair: its noise, see `noise_of`, and its row offsets; None if unknown."""
+    """What looks at blocks of a region of the left image tell of a pair, over disparities ``search``.
 
+    ``noise``, see `noise_of`, and ``rows`` are None if unknown.
+    """
+
+    region: Window
+    search: tuple[int, int]
     noise: float | None
     rows: RowFit | None
 
+    @classmethod
+    def of_looks(
+        cls, region: Window, search: tuple[int, int], looks: Sequence[Look], shape: tuple[int, int]
+    ) -> "Survey":
+        """Return what looks tell of a pair whose right image has so many rows and columns; see `fit_rows`."""
+        return cls(region, search, noise_of(looks), fit_rows(looks, *shape))
+
     @property
-    def taken(self) -> RowOffsets | None:
-        """Return the row offsets if they are large enough to be taken out: below that, resampling costs more."""
-        return self.rows.offsets if self.rows and self.rows.most >= TAKEN else None
+    def is_large(self) -> bool:
+        """Return whether row offsets are large enough to be taken out: below that, resampling costs more."""
+        return self.rows is not None and self.rows.most >= TAKEN
+
+    def taken(self, rows: str) -> RowOffsets | None:
+        """Return the row offsets to take out by the setting ``rows``; raise if the pair is not epipolar."""
+        if rows == "none" or self.rows is None:
+            return None
+        if line := self.rows.contradiction:
+            raise SatIntervalsError(f"{line}: resample the pair, or give --rows none")
+        return self.rows.offsets if self.is_large else None
 
     def report(self) -> dict[str, Any]:
         """Return the mapping that the store and run.json hold."""
-        return {"noise": self.noise, "rows": self.rows and self.rows.report()}
+        return asdict(self)
 
     @classmethod
     def of_report(cls, report: Mapping[str, Any]) -> "Survey":
         """Read the mapping that `report` makes."""
-        return cls(report["noise"], report["rows"] and RowFit.of_report(report["rows"]))
-
-
-def surveyed(looks: Sequence[Look], rows: int, columns: int) -> Survey:
-    """Return what looks tell of a pair whose right image has so many rows and columns; see `fit_rows`."""
-    return Survey(noise_of(looks), fit_rows(looks, rows, columns))
+        rows = report["rows"] and RowFit.of_report(report["rows"])
+        return cls(Window(**report["region"]), tuple(report["search"]), report["noise"], rows)
 
 
 def fit_rows(looks: Sequence[Look], rows: int, columns: int) -> RowFit | None:
     """Fit the row offsets of looks at a pair; ``rows`` and ``columns`` are those of the right image.
 
     Of polynomials the one of the lowest degree is taken unless a higher one leaves clearly less in looks that it was
-    not fitted to. None with fewer than three looks. Raise if offsets are larger than what is searched, or contradict
-    each other.
+    not fitted to. None with fewer than three looks.
     """
     if len(looks) < _FEWEST:
         return None
@@ -111,16 +141,14 @@ def fit_rows(looks: Sequence[Look], rows: int, columns: int) -> RowFit | None:
             best = count
     found = _fit(nothing.design(row, column, best), offset)
     offsets = RowOffsets(tuple(round(float(value), 6) for value in found), rows, columns)
-    ends = offsets.at(np.linspace(0, rows - 1, 9)[:, np.newaxis], np.linspace(0, columns - 1, 9))
-    most = float(np.abs(ends).max())
+    # the looks are the middles of blocks
+    around = [
+        np.linspace(max(0, places.min() - _HALF), min(size - 1, places.max() + _HALF), 9)
+        for places, size in ((row, rows), (column, columns))
+    ]
+    most = float(np.abs(offsets.at(around[0][:, np.newaxis], around[1])).max())
     before, after = np.abs(offset), np.abs(left[best])
-    if np.median(before) > _MOST or most > 2 * _MOST or np.median(after) > _CONTRADICTING:
-        raise SatIntervalsError(
-            f"not an epipolar pair: rows differ by {np.median(before):.1f} px in the median, up to {most:.1f} px, and "
-            f"by {np.median(after):.1f} px from a smooth function, over {sum(look.number for look in looks)} matches; "
-            f"{_MOST:g} px are searched: resample the pair"
-        )
-    places = np.stack([row, column, offset, offset - offsets.at(row, column)], axis=1).round(3)
+    places = np.stack([row, column, offset, left[best]], axis=1).round(3)
     return RowFit(
         offsets,
         sum(look.number for look in looks),

@@ -25,6 +25,8 @@ _CELL = 8
 # Matches of a level and of a part that are needed at least.
 _FEWEST_COARSE, _FEWEST = 100, 500
 _CENSUS, _BITS = 5, 24
+# Share of matches that a pixel of a level farther from the middle of a block must be worth.
+_AWAY_FROM_MIDDLE = 0.0005
 # Distance of the random candidates that a match is compared with, in columns.
 _AWAY = 16
 # Least-squares windows: pixels between centres, from the centre to the sides, and the share that must be matched.
@@ -49,7 +51,7 @@ class Spot(NamedTuple):
 class Look(NamedTuple):
     """Figures of a block.
 
-    row, column: middle of the part that was matched, in the right image.
+    row, column: middle of the part that was matched, row of the left and column of the right image.
     number: matches there.
     matched, random: mean distances of their codes, and of those of random candidates.
     rows: median of the rows by which the right image lies lower, in pixels.
@@ -97,7 +99,7 @@ def look(spot: Spot, left: View, right: View) -> Look | None:
         rows += round(shift)
     else:
         return None
-    middle = figures.row + part.row + part.height / 2, figures.column + part.column + part.width / 2
+    middle = part.row + (part.height - 1) / 2, figures.column + part.column + (part.width - 1) / 2
     return figures._replace(row=middle[0], column=middle[1], rows=rows + shift)
 
 
@@ -150,10 +152,12 @@ def _coarse_offsets(left: np.ndarray, right: np.ndarray, matches: Matches) -> np
 
 
 def _part(matches: Matches, block: Window) -> tuple[Window, int, int]:
-    """Return the part of a block where most is matched, and the range of its disparities from the first searched."""
+    """Return the part of a block where most is matched, rather in its middle, and the range of disparities there."""
     side = min(_PART // _STEP.rows, *matches.kept.shape)
     shares = np.lib.stride_tricks.sliding_window_view(matches.kept, (side, side)).mean(axis=(2, 3))
-    r, c = map(int, np.unravel_index(np.argmax(shares), shares.shape))
+    away = [np.abs(np.arange(size) - (size - 1) / 2) for size in shares.shape]
+    score = shares - _AWAY_FROM_MIDDLE * np.maximum(away[0][:, np.newaxis], away[1])
+    r, c = map(int, np.unravel_index(np.argmax(score), score.shape))
     here = np.s_[r : r + side, c : c + side]
     low, high = np.quantile(matches.disparity[here][matches.kept[here]] * _STEP.columns, [0.02, 0.98])
     part = Window(block.row + r * _STEP.rows, block.column + c * _STEP.columns, side * _STEP.rows, side * _STEP.columns)

@@ -168,8 +168,11 @@ def handed_bytes(grid: Grid, config: Config, images: Iterable[Any], *, keeps_pix
     if keeps_pixels:
         blocks, support = blocks_of(grid, config), 2 * config.tiles.support
         around = 2 * (config.cost.window // 2 + 1)
-        for image in images:
+        sizes = [np.dtype(image.dtype).itemsize for image in images]
+        if config.rows == "auto":
+            sizes[1] = max(sizes[1], np.dtype(np.float32).itemsize)  # of rows that were taken out
+        for image, size in zip(images, sizes, strict=True):
             rows = min(image.height, height + support) + blocks.rows * around
             columns = min(image.width, width + support) + blocks.columns * (around + views * count)
-            kept += rows * columns * (np.dtype(image.dtype).itemsize + 1)  # with its state
+            kept += rows * columns * (size + 1)  # with its state
     return views * (states + costs) + kept

@@ -38,8 +38,8 @@ def read_window(image: Image, window: Window) -> tuple[np.ndarray, np.ndarray]:
     """
     if image.rows is None or 0 in (window.height, window.width):
         return _read_window(image, window)
-    row, rows, offset = image.rows.read(window.row, window.column, window.height, window.width)
-    pixels, state = shift_rows(*_read_window(image, Window(row, window.column, rows, window.width)), offset)
+    row, rows, *places = image.rows.read(window.row, window.column, window.height, window.width)
+    pixels, state = shift_rows(*_read_window(image, Window(row, window.column, rows, window.width)), *places)
     return pixels, state
 
 

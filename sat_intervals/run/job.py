@@ -48,7 +48,7 @@ class Finds(Protocol):
 
 
 # Settings without effect on tiles; those of the preset itself are listed one by one.
-_NOT_OF_TILES = {"preset", "median", "regularization", "products", "cluster"}
+_NOT_OF_TILES = {"preset", "rows", "median", "regularization", "products", "cluster"}
 # Files of `ONCE`.
 _STATISTICS, _RANGE = "statistics", "range"
 _REMOTE = "check URL and credentials, and pip install the package of its file system ('sat-intervals[remote]' for S3)"
@@ -83,11 +83,6 @@ class Job:
         """Return all that decides the bytes of a tile, and where the tiles are."""
         made = _manifest(self.config, self.inputs, self.store.grid.region, self.ranges_digest, self.right.rows)
         return made | {PLACE: None if self.is_home else str(self.store.folder)}
-
-    @property
-    def surveyed(self) -> str:
-        """Return a digest of what was surveyed."""
-        return _surveyed(self.config, self.store.grid.region)
 
     @property
     def is_home(self) -> bool:
@@ -128,8 +123,7 @@ class Job:
             if self.found or self.local or self.survey:
                 found, ranges = self.found and self.found.report(), self.local and self.local.report()
                 of, survey = origin_of(self.inputs), self.survey and self.survey.report()
-                more = {"survey": survey, "surveyed": self.surveyed}
-                self.store.write(ONCE, _RANGE, of=of, found=found, ranges=ranges, of_rows=more)
+                self.store.write(ONCE, _RANGE, of=of, found=found, ranges=ranges, survey=survey)
         except OSError as error:
             way_out = "make room, check its rights or choose another folder" if self.store.folder.is_local else _REMOTE
             raise StoreError(f"{self.store.folder} cannot be used: {error.strerror or error}: {way_out}") from error
@@ -194,7 +188,7 @@ class Job:
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what workers read from the store, see `ranges`."""
-        return self.__dict__ | {"local": None}
+        return self.__dict__ | {"local": None, "survey": None}
 
     def waiting(self) -> list[Tile]:
         """Return the tiles that are not done."""
@@ -235,8 +229,7 @@ def prepare(
     config = fitted_to_jobs(config)
     check_tiles(config, region)
     survey = _survey(known, find, left, right, config, region)
-    if survey and config.rows == "auto":
-        right = replace(right, rows=survey.taken)
+    right = replace(right, rows=_rows_taken(survey, config, left, right))
     read = [*identities(inputs), *(files_of(config.disparity.grid) if config.disparity.grid else ())]
     ranges = digest(local.report()) if local else None
     run = digest(_manifest(config, inputs, region, ranges, right.rows))
@@ -248,13 +241,12 @@ def prepare(
 
 
 def _known(out: Path, before: Mapping[str, Any], inputs: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return what an earlier run of the same images has found: ``found``, ``survey`` and what was ``surveyed``."""
+    """Return what an earlier run of the same images has found: ``found`` and ``survey``."""
     if PLACE in before:
         store = Store(place_of(home_of(out), before), _NO_TILES, "")
-        kept = store.meta(ONCE, _RANGE, origin_of(inputs)) or {}
-        return {**kept, **kept.get("of_rows", {})}
+        return store.meta(ONCE, _RANGE, origin_of(inputs)) or {}
     if before.get("origin") == origin_of(inputs):
-        return {"found": before["search"], "survey": before["survey"], "surveyed": before["surveyed"]}
+        return {"found": before["search"], "survey": before["survey"]}
     return {}
 
 
@@ -269,14 +261,19 @@ def _found(known: Mapping[str, Any], find: Finds | None, left: Image, right: Ima
 def _survey(
     known: Mapping[str, Any], find: Finds | None, left: Image, right: Image, config: Config, region: Window
 ) -> Survey | None:
-    if known.get("survey") and known["surveyed"] == _surveyed(config, region):
-        return Survey.of_report(known["survey"])
     search = config.disparity.minimum, config.disparity.maximum
+    if known.get("survey"):
+        survey = Survey.of_report(known["survey"])
+        if (survey.region, survey.search) == (region, search):
+            return survey
     return find.survey(left, right, region, search) if find else None
 
 
-def _surveyed(config: Config, region: Window) -> str:
-    return digest({"region": asdict(region), "search": [config.disparity.minimum, config.disparity.maximum]})
+def _rows_taken(survey: Survey | None, config: Config, left: Image, right: Image) -> RowOffsets | None:
+    try:
+        return survey.taken(config.rows) if survey else None
+    except SatIntervalsError as error:
+        raise SatIntervalsError(f"{left.path} and {right.path}: {error}") from None
 
 
 def origin_of(inputs: Mapping[str, Any]) -> str:

@@ -93,7 +93,9 @@ def rows_left(survey: Survey | None, rows: str, path: str) -> list[str]:
     if survey is None or survey.rows is None:
         return []
     found = survey.rows
-    if rows == "none" and survey.taken and found.before[0] > _ROW_OFFSET:
+    if found.contradiction:
+        return [f"{path}: {found.contradiction}"]
+    if rows == "none" and survey.is_large and found.before[0] > _ROW_OFFSET:
         return [f"{path}: rows differ by {found.before[0]:.1f} px in the median: match with --rows auto"]
     if found.has_jitter:
         return [

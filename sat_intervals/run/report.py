@@ -78,7 +78,6 @@ def report_of(
         "requested": {"disparity": job.requested},
         "search": job.found and job.found.report(),
         "survey": job.survey and job.survey.report(),
-        "surveyed": job.surveyed,
         "rows": job.right.rows and asdict(job.right.rows),
         "origin": origin_of(job.inputs),
         "local_ranges": job.local and job.local.report() | {"share": job.local.share},

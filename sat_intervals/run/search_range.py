@@ -10,10 +10,10 @@ from typing import Any, NoReturn
 import numpy as np
 
 from sat_intervals.config import Cluster
-from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.errors import RunError
 from sat_intervals.match.memory import check_memory
 from sat_intervals.match.normalization import BLOCK, blocks
-from sat_intervals.match.rows import Survey, surveyed
+from sat_intervals.match.rows import Survey
 from sat_intervals.match.sampling import Look, Spot, look, spots
 from sat_intervals.match.search_range import (
     Found,
@@ -58,6 +58,7 @@ class Finder:
     workers: Workers
     progress: Progress
     seconds: dict[str, float] = field(default_factory=dict)
+    surveys: dict[Any, Survey] = field(default_factory=dict)
 
     def search_range(self, left: Image, right: Image) -> Found:
         """Find the search range, see `search_range`."""
@@ -65,16 +66,19 @@ class Finder:
             return search_range(self.workers, left, right, self.progress)
 
     def survey(self, left: Image, right: Image, region: Window, search: tuple[int, int]) -> Survey:
-        """Look at blocks of a region of the left image over a search range: noise and row offsets."""
+        """Look at blocks of a region of the left image over a search range: noise and row offsets; once for each."""
+        key = left.path, right.path, region, search
+        if key not in self.surveys:
+            self.surveys[key] = self._survey(left, right, region, search)
+        return self.surveys[key]
+
+    def _survey(self, left: Image, right: Image, region: Window, search: tuple[int, int]) -> Survey:
         with logged_stage(self.seconds, "start.rows"):
             compile_kernels(settings(0, 3), hands_states_on=False)
             chosen = [(left, right, spot) for spot in spots(region, *search)]
             results = sorted(_results(self.workers, look_at, chosen, self.progress, "rows"), key=itemgetter(0))
             looks = [found for _, found in results if found is not None]
-            try:
-                return surveyed(looks, right.height, right.width)
-            except SatIntervalsError as error:
-                raise SatIntervalsError(f"{left.path} and {right.path}: {error}") from None
+            return Survey.of_looks(region, search, looks, (right.height, right.width))
 
 
 def search_range(workers: Workers, left: Image, right: Image, progress: Progress) -> Found:

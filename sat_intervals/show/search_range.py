@@ -1,4 +1,4 @@
-"""Draw how the search range of a run was found, and the local ranges."""
+"""Draw what was found before the tiles: the search range, local ranges, and row offsets."""
 
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,9 @@ from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.results import Results
 from sat_intervals.show.canvas import DPI, INK, Frame, MapLayer, draw_layer, page
 from sat_intervals.show.legend import BLUE, SKY
+
+# Pixels of offset at the ends of the colours of row offsets, at least.
+_LEAST = 0.5
 
 
 def has_range(results: Results) -> bool:
@@ -55,3 +58,27 @@ def _draw_matches(chart: Axes, found: dict[str, Any], searched: tuple[int, int])
     chart.text(
         0.02, 0.98, f"searched at {levels}", transform=chart.transAxes, va="top", fontsize=8, color=INK, wrap=True
     )
+
+
+def has_rows(results: Results) -> bool:
+    """Return whether the rows of a run were compared."""
+    return bool((results.report.get("survey") or {}).get("rows"))
+
+
+def draw_rows(results: Results, target: Path, dpi: int = DPI) -> None:
+    """Draw the row offsets at the places that were looked at, and what the function leaves of them, in pixels."""
+    found = results.report["survey"]["rows"]
+    row, column, before, after = np.array(found["looks"]).T
+    done = "taken out of the right image" if results.rows else "left as they are"
+    title = (
+        f"{Path(results.right.path).name}: rows differ by {found['before'][0]:.2f} px in the median, "
+        f"{found['after'][0]:.2f} px from a smooth function; {done}"
+    )
+    with page(target, (9.2, 4.2), dpi, title) as figure:
+        panels = figure.subplots(1, 2)
+        for panel, values, name in zip(panels, (before, after), ("Row offset, px", "What is left, px"), strict=True):
+            most = max(_LEAST, float(np.abs(values).max()))
+            dots = panel.scatter(column, row, c=values, s=150, cmap="RdBu", vmin=-most, vmax=most, edgecolors="0.4")
+            panel.set(title=name, xlim=(0, results.right.width), ylim=(results.right.height, 0), aspect="equal")
+            panel.set(xlabel="column", ylabel="row")
+            figure.colorbar(dots, ax=panel)

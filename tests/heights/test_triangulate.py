@@ -27,8 +27,9 @@ from sat_intervals.results import open_run
 from sat_intervals.tiling import Window
 
 with suppress(SatIntervalsError):  # without shareloc all tests here are skipped
-    from sat_intervals.heights.geometry import set_geometry
+    from sat_intervals.heights.geometry import geometry_of, set_geometry
     from sat_intervals.heights.lattice import Extent, Ground, on_map
+    from sat_intervals.heights.location import Location
     from sat_intervals.heights.sensors import Sensors, lattice_of
     from sat_intervals.heights.triangulate import triangulate
 
@@ -501,6 +502,10 @@ def test_dsm_command__points_are_those_of_the_rows_that_were_matched(level_run, 
     result = invoke("triangulate", out, *words, "--output", expected[1])
     assert (result.exit_code, result.stderr) == (0, "")
     one, other = map(read, expected)
+    misfit = Location(sensors := geometry_of(open_run(out)).sensors)
+    row, column, disparity = np.array([5, 30]), np.array([7, 40]), np.array([1.0, 2.0])
+    seen = misfit.positions(*sensors.triangulate(row, column, disparity)[:, :3].T)
+    np.testing.assert_allclose(seen[:, 2] - row, lower.at(row, column + disparity), atol=0.01)
     pixel = 0.02 * PIXEL
     assert np.abs(one[2:5] - other[2:5]).max() < pixel
     assert (np.abs(one[0] - other[0]) * EAST).max() < pixel

@@ -1,11 +1,14 @@
 """Row offsets fitted to looks at blocks of a pair."""
 
+import json
+
 import numpy as np
 import pytest
 
 from sat_intervals import SatIntervalsError
 from sat_intervals.match.rows import RowFit, Survey, fit_rows
 from sat_intervals.match.sampling import Look
+from sat_intervals.tiling import Window
 
 
 def looks_at(function, count=25, side=1000, wrong=0, noise=0.0, seed=0):
@@ -39,16 +42,32 @@ def test_fit_rows__rows_that_jump_are_jitter():
     assert fit.has_jitter
 
 
-def test_fit_rows__refuses_pairs_that_are_not_epipolar():
+def test_survey__refuses_pairs_that_are_not_epipolar():
     random = np.random.default_rng(1)
     for function in (lambda r, c: random.uniform(-8, 8, r.shape), lambda r, c: 14 + 0 * r):
+        survey = survey_of(looks_at(function))
         with pytest.raises(SatIntervalsError, match=r"not an epipolar pair: rows differ by .* px in the median"):
-            fit_rows(looks_at(function), 1000, 1000)
+            survey.taken("auto")
+        assert survey.taken("none") is None
+
+
+def survey_of(looks):
+    return Survey.of_looks(Window(0, 0, 1000, 1000), (-9, 9), looks, (1000, 1000))
 
 
 def test_survey__takes_out_what_is_large_enough():
     for size, taken in ((0.2, False), (0.5, True)):
-        fit = fit_rows(looks_at(lambda r, c, size=size: size + 0 * r), 1000, 1000)
-        assert (Survey(0.4, fit).taken is not None) == taken
-    assert Survey(None, None).taken is None
-    assert fit_rows(looks_at(lambda r, c: 0 * r, count=2), 1000, 1000) is None
+        survey = survey_of(looks_at(lambda r, c, size=size: size + 0 * r))
+        assert (survey.taken("auto") is not None) == taken
+        assert survey.taken("none") is None
+        assert Survey.of_report(json.loads(json.dumps(survey.report()))) == survey
+    nothing = survey_of(looks_at(lambda r, c: 0 * r, count=2))
+    assert (nothing.rows, nothing.taken("auto")) == (None, None)
+
+
+def test_fit_rows__does_not_judge_places_far_from_the_looks():
+    """A small region of a large image, whose plane reaches many pixels elsewhere."""
+    near = [look._replace(row=look.row / 4, column=look.column / 4) for look in looks_at(lambda r, c: 0.002 * (r - c))]
+    survey = Survey.of_looks(Window(0, 0, 250, 250), (-9, 9), near, (20_000, 20_000))
+    assert survey.rows.most < 5
+    assert survey.taken("auto") is not None

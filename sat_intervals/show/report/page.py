@@ -61,7 +61,7 @@ def _rows(run: Mapping[str, Any]) -> dict[str, str]:
     found = (run.get("survey") or {}).get("rows")
     if not found:
         return {}
-    left = f", taken out up to {found['after'][0]:.2f} px" if run.get("rows") else ""
+    left = f", {found['after'][0]:.2f} px after they were moved" if run.get("rows") else ""
     return {"rows of the two images differ by": f"{found['before'][0]:.2f} px in the median{left}"}
 
 
