@@ -1,5 +1,6 @@
 """How far the rows of two images differ: a smooth function of the place, fitted to looks at blocks of the pair."""
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -114,7 +115,8 @@ class Survey:
 
     def report(self) -> dict[str, Any]:
         """Return the mapping that the store and run.json hold."""
-        return asdict(self)
+        report: dict[str, Any] = json.loads(json.dumps(asdict(self)))  # lists, as a file gives them back
+        return report
 
     @classmethod
     def of_report(cls, report: Mapping[str, Any]) -> "Survey":
