@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from sat_intervals.config import Cluster
-from sat_intervals.errors import RunError
+from sat_intervals.errors import InputError, RunError
 from sat_intervals.match.memory import check_memory
 from sat_intervals.match.normalization import BLOCK, blocks
 from sat_intervals.match.rows import Survey
@@ -46,9 +46,13 @@ def reduce_block(image: Image, block: Window, step: Step) -> tuple[np.ndarray, f
 
 
 def look_at(left: Image, right: Image, spot: Spot) -> Look | None:
-    """Look at a block; runs on a worker."""
+    """Look at a block, None where it cannot be read: its tiles will say so; runs on a worker."""
     with picklable_errors():
-        return look(spot, *read_views((left, right), spot.views))
+        try:
+            views = read_views((left, right), spot.views)
+        except InputError:
+            return None
+        return look(spot, *views)
 
 
 @dataclass(frozen=True)

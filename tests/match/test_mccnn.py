@@ -303,7 +303,7 @@ def test_match_pair__an_image_that_cannot_be_measured_fails_the_run(tmp_path, ne
     left, right = masked_images(70, 140)
     images = write(tmp_path / "left.tif", left), write(tmp_path / "right.tif", right)
     images[1].write_bytes(images[1].read_bytes()[:-4000])
-    with pytest.raises(RunError, match=r"right\.tif cannot be read at .*the file may be truncated"):
+    with pytest.raises(RunError, match=r"right\.tif could not be measured: .*the file may be truncated"):
         match_pair(*images, tmp_path / "out", settings(-4, 6, network_file))
 
 
@@ -350,7 +350,7 @@ def test_match_batch__measures_each_pair_and_goes_on_after_one_that_it_cannot(tm
     cost = {"preset": "mccnn", "cost": {"weights": str(network_file)}}
     report = match_batch(pairs, tmp_path / "out", cost)
     assert {name: end["state"] for name, end in report.items()} == {"broken": "failed", "whole": "done"}
-    assert "cut.tif cannot be read at" in report["broken"]["error"]
+    assert "cut.tif could not be measured" in report["broken"]["error"]
     match_pair(tmp_path / "left.tif", tmp_path / "right.tif", tmp_path / "alone", SEARCH | cost)
     for one, other in zip(bands(tmp_path / "out" / "whole"), bands(tmp_path / "alone"), strict=True):
         np.testing.assert_array_equal(one, other)
