@@ -184,7 +184,7 @@ def test_page__tells_what_the_run_tells(page):
         assert words in page.text(selector)
     assert page.browser.execute_script("return document.querySelectorAll('svg[role=img][aria-label]').length") == 4
     assert not page.browser.find_elements(By.CSS_SELECTOR, "#loading")
-    assert not {"walltime", "none"} & set(page.text("#run").split())  # settings without a value
+    assert not {"null", "walltime"} & set(page.text("#run").split())  # settings without a value
 
 
 def test_page__without_scripts_shows_a_table(browser, tmp_path):
