@@ -19,7 +19,7 @@ from sat_intervals.tiling import Window
 _TILE = 1024
 # Cells of a strip of tiles, 24 bytes each, a few strips in memory; tiles of wide surfaces have fewer rows.
 _STRIP_CELLS, _LOWEST = 1 << 21, 64
-# Bounds listed for the medians of a tile: 8 bytes each.
+# Bounds listed for the medians of a tile: 4 bytes each.
 _LISTED = 1 << 24
 # Widths are counted in steps of 2 cm, up to so many metres.
 _STEPS, _WIDEST = 50, 1000

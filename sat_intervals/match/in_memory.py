@@ -122,10 +122,8 @@ def _with_rows(
     left: np.ma.MaskedArray, right: np.ma.MaskedArray, config: Config
 ) -> tuple[np.ma.MaskedArray, RowOffsets | None]:
     """Return the right image at the rows of the left one, itself if they correspond, and the offsets taken out."""
-    views = whole_view(left), whole_view(right)
-    chosen = spots(Window(0, 0, *left.shape), config.disparity.minimum, config.disparity.maximum)
-    found = (look(spot, *map(cut, views, spot.views)) for spot in chosen)
-    search = config.disparity.minimum, config.disparity.maximum
+    views, search = (whole_view(left), whole_view(right)), (config.disparity.minimum, config.disparity.maximum)
+    found = (look(spot, *map(cut, views, spot.views)) for spot in spots(views[0].window, *search))
     rows = Survey.of_looks(views[0].window, search, [one for one in found if one], right.shape).taken(config.rows)
     if rows is None:
         return right, None

@@ -19,11 +19,11 @@ _BETTER = 0.7
 # Steps of the fit, and the least scale of its residuals in pixels: residuals of twice the scale count half.
 _STEPS, _SCALE = 30, 0.05
 # Pixels of offset from which on rows are taken out, and that are searched.
-TAKEN, _MOST = 0.3, 12.0
+_TAKEN, _MOST = 0.3, 12.0
 # Pixels from the middle of a look to the rim of its block.
 _HALF = 128
 # Pixels of residual that a smooth function should not leave in a quarter of the looks, or in half of them.
-JITTER, _CONTRADICTING = 0.3, 0.5
+_JITTER, _CONTRADICTING = 0.3, 0.5
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class RowFit:
     @property
     def has_jitter(self) -> bool:
         """Return whether offsets are not smooth: detector joins, or oscillations of the satellite."""
-        return bool(np.quantile([abs(look[3]) for look in self.looks], 0.75) > JITTER)
+        return bool(np.quantile([abs(look[3]) for look in self.looks], 0.75) > _JITTER)
 
     @property
     def contradiction(self) -> str | None:
@@ -69,13 +69,9 @@ class RowFit:
             f"{after:.1f} px from a smooth function, over {self.matches} matches; {_MOST:g} px are searched"
         )
 
-    def report(self) -> dict[str, Any]:
-        """Return the mapping that run.json holds."""
-        return asdict(self)
-
     @classmethod
     def of_report(cls, report: Mapping[str, Any]) -> "RowFit":
-        """Read the mapping that `report` makes."""
+        """Read what a report of a survey has of it."""
         offsets = RowOffsets.of_report(report["offsets"])
         pairs = {name: tuple(report[name]) for name in ("before", "after")}
         return cls(**dict(report) | pairs | {"offsets": offsets, "looks": tuple(map(tuple, report["looks"]))})
@@ -103,7 +99,7 @@ class Survey:
     @property
     def is_large(self) -> bool:
         """Return whether row offsets are large enough to be taken out: below that, resampling costs more."""
-        return self.rows is not None and self.rows.most >= TAKEN
+        return self.rows is not None and self.rows.most >= _TAKEN
 
     def taken(self, rows: str) -> RowOffsets | None:
         """Return the row offsets to take out by the setting ``rows``; raise if the pair is not epipolar."""

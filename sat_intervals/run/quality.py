@@ -30,9 +30,11 @@ def is_plain(image: Image) -> bool:
 
 def quality_of(job: Job) -> dict[str, Any]:
     """Return the quality of a pair: ``noise``, see `noise_of`, and ``collars``, see `Found`."""
-    region = job.store.grid.region
-    found = {side: _collar(image, region) for side, image in (("left", job.left), ("right", job.right))}
-    collars = job.found.collars if job.found else {side: collar for side, collar in found.items() if collar}
+    region, sides = job.store.grid.region, (("left", job.left), ("right", job.right))
+    if job.found:
+        collars = job.found.collars
+    else:
+        collars = {side: collar for side, image in sides if (collar := _collar(image, region))}
     return {"noise": job.survey and job.survey.noise, "collars": collars}
 
 

@@ -62,7 +62,6 @@ class Finder:
     workers: Workers
     progress: Progress
     seconds: dict[str, float] = field(default_factory=dict)
-    surveys: dict[Any, Survey] = field(default_factory=dict)
 
     def search_range(self, left: Image, right: Image) -> Found:
         """Find the search range, see `search_range`."""
@@ -70,18 +69,12 @@ class Finder:
             return search_range(self.workers, left, right, self.progress)
 
     def survey(self, left: Image, right: Image, region: Window, search: tuple[int, int]) -> Survey:
-        """Look at blocks of a region of the left image over a search range: noise and row offsets; once for each."""
-        key = left.path, right.path, region, search
-        if key not in self.surveys:
-            self.surveys[key] = self._survey(left, right, region, search)
-        return self.surveys[key]
-
-    def _survey(self, left: Image, right: Image, region: Window, search: tuple[int, int]) -> Survey:
+        """Look at blocks of a region of the left image over a search range: noise and row offsets."""
         with logged_stage(self.seconds, "start.rows"):
             compile_kernels(settings(0, 3), hands_states_on=False)
             chosen = [(left, right, spot) for spot in spots(region, *search)]
-            results = sorted(_results(self.workers, look_at, chosen, self.progress, "rows"), key=itemgetter(0))
-            looks = [found for _, found in results if found is not None]
+            found = sorted(_results(self.workers, look_at, chosen, self.progress, "rows"), key=itemgetter(0))
+            looks = [one for _, one in found if one is not None]
             return Survey.of_looks(region, search, looks, (right.height, right.width))
 
 
