@@ -10,6 +10,7 @@ from sat_intervals.config.files import read_mapping
 from sat_intervals.config.presets import PRESETS, merged, preset_settings
 from sat_intervals.config.sections import ConfigError
 from sat_intervals.config.settings import Config
+from sat_intervals.config.weights import NETWORKS
 from sat_intervals.config.wording import explained, shown
 
 # Settings that name a file.
@@ -85,7 +86,7 @@ def named_files(settings: Mapping[str, Any] | Config | None) -> list[str]:
     """Return the files that sections name, which are read with them or later; a built-in name has no file."""
     sections = settings.model_dump() if isinstance(settings, Config) else settings or {}
     named = [sections[name].get(key) for name, key in _FILES if isinstance(sections.get(name), Mapping)]
-    return [file for file in named if isinstance(file, str)]
+    return [file for file in named if isinstance(file, str) and file not in NETWORKS]
 
 
 def _given(overrides: Any, path: tuple[int | str, ...]) -> bool:

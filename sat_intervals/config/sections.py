@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, model_validator
 from pydantic_core import PydanticCustomError
 
+from sat_intervals.config.weights import NETWORKS
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import COSINE_STEPS
 
@@ -39,6 +40,11 @@ def absolute(value: str) -> str:
     """Return a path that workers with another working directory find; ".." after a link leaves the link's target."""
     path = Path(value).absolute()
     return str(path.parent.resolve() / path.name if ".." in path.parts else path)
+
+
+def network(value: str) -> str:
+    """Return the name of a network as it is, and that of a file as a path."""
+    return value if value in NETWORKS else absolute(value)
 
 
 Odd = Annotated[int, AfterValidator(check_odd)]
@@ -142,7 +148,9 @@ class Mccnn(Section):
     """Matching cost: 1 - cosine of features of the network MC-CNN fast (Zbontar and LeCun 2016)."""
 
     method: Literal["mccnn"] = Field("mccnn", description="matching cost, census or mccnn")
-    weights: AbsolutePath | None = Field(None, description="ONNX file of the network; null: that of the extra [mccnn]")
+    weights: Annotated[str, AfterValidator(network)] = Field(
+        "full", description="network of the extra [mccnn], full or depthwise, or an ONNX file"
+    )
 
     window: ClassVar = 11  # side of the receptive field of a feature, in pixels
     steps: ClassVar = COSINE_STEPS  # quantisation levels per unit of cost, a unit of the cosine

@@ -5,31 +5,33 @@ from pathlib import Path
 
 from sat_intervals.errors import SatIntervalsError
 
-# The distribution of the official weights, and the file in it that Pandora uses.
-_DISTRIBUTION, _OFFICIAL = "MCCNN", "mc_cnn_fast_int8_excl_01.onnx"
+# The distribution of the official weights, and its files: the one that Pandora uses, and one of depthwise convolutions.
+_DISTRIBUTION = "MCCNN"
+NETWORKS = {"full": "mc_cnn_fast_int8_excl_01.onnx", "depthwise": "mc_cnn_fast_dw.onnx"}
 INSTALL_MCCNN = "pip install 'sat-intervals[mccnn]'"
 # Largest file of weights in bytes; the official one has 0.4 MB.
 _LARGEST = 256 * 10**6
+_NAMES = " or ".join(NETWORKS)
 
 
-def weights_file(weights: str | None) -> Path:
-    """Find the file of a network: the given one, or the official one without an import of its package."""
-    if weights is not None:
+def weights_file(weights: str) -> Path:
+    """Find the file of a network: a given one, or an official one without an import of its package."""
+    if weights not in NETWORKS:
         if not Path(weights).is_file():
-            raise SatIntervalsError(f"cost.weights {weights}: no such file: name an ONNX network, or null")
+            raise SatIntervalsError(f"cost.weights {weights}: no such file: name an ONNX network, or {_NAMES}")
         size = Path(weights).stat().st_size
         if size > _LARGEST:
             raise SatIntervalsError(
                 f"cost.weights {weights} has {size / 1e6:.0f} MB, a network like MC-CNN has less than "
-                f"{_LARGEST / 1e6:.0f} MB: name an ONNX network, or null"
+                f"{_LARGEST / 1e6:.0f} MB: name an ONNX network, or {_NAMES}"
             )
         return Path(weights).resolve()
     try:
-        found = [file for file in files(_DISTRIBUTION) or [] if file.name == _OFFICIAL]
+        found = [file for file in files(_DISTRIBUTION) or [] if file.name == NETWORKS[weights]]
     except PackageNotFoundError as error:
         raise SatIntervalsError(f"cost mccnn needs the package {_DISTRIBUTION}: {INSTALL_MCCNN}") from error
     if not found:
         raise SatIntervalsError(
-            f"the installed {_DISTRIBUTION} has no {_OFFICIAL}: {INSTALL_MCCNN}, or set cost.weights"
+            f"the installed {_DISTRIBUTION} has no {NETWORKS[weights]}: {INSTALL_MCCNN}, or set cost.weights"
         )
     return Path(str(found[0].locate())).resolve()

@@ -44,7 +44,7 @@ class Tuned:
 def has_network() -> bool:
     """Return whether MC-CNN and its weights are installed."""
     try:
-        load_network(weights_file(None))
+        load_network(weights_file("full"))
     except SatIntervalsError:
         return False
     return True

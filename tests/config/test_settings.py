@@ -263,7 +263,7 @@ REFUSED = [
     ("cost", None, "cost is null, allowed: section of method, window"),
     ("cost", {"method": "sad"}, "cost.method is 'sad', allowed: census or mccnn"),
     ("cost", {"method": "mccnn", "window": 5}, "unknown key 'cost.window' (known: method, weights)"),
-    ("cost", {"method": "mccnn", "weights": 3}, "cost.weights is 3, allowed: text or null"),
+    ("cost", {"method": "mccnn", "weights": 3}, "cost.weights is 3, allowed: text"),
     ("sgm", {"penalty": "linear"}, "sgm.penalty is 'linear', allowed: constant or mc_cnn_fast"),
     ("sgm", {"penalty": "mc_cnn_fast"}, "sgm.penalty is mc_cnn_fast, allowed: constant with cost.method census"),
     ("sgm", {"p1": 8.5}, "sgm.p1 is 8.5, allowed: whole numbers with census"),

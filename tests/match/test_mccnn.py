@@ -60,8 +60,8 @@ def fp32(shared_data, tmp_path_factory):
     return trained_network(shared_data, tmp_path_factory.mktemp("network") / "mb.onnx")
 
 
-def settings(minimum, maximum, weights=None, **sections):
-    cost = {"method": "mccnn", "weights": None if weights is None else str(weights)}
+def settings(minimum, maximum, weights="full", **sections):
+    cost = {"method": "mccnn", "weights": str(weights)}
     return load_config(
         {"preset": "mccnn", "disparity": {"minimum": minimum, "maximum": maximum}, "cost": cost} | sections
     )
@@ -79,11 +79,13 @@ def masked_images(rows=34, columns=46, seed=1):
 
 # ---- Networks ----------------------------------------------------------------------------------------------
 def test_weights_file__is_found_without_importing_its_package():
-    file = weights_file(None)
-    assert file.name == "mc_cnn_fast_int8_excl_01.onnx"
-    assert file.is_file()
+    names = {"full": "mc_cnn_fast_int8_excl_01.onnx", "depthwise": "mc_cnn_fast_dw.onnx"}
+    for name, official in names.items():
+        file = weights_file(name)
+        assert file.name == official
+        assert load_network(file) is load_network(file)
+        assert load_network(file).count == 64
     assert "mc_cnn" not in sys.modules
-    assert load_network(file) is load_network(file)
 
 
 def test_load_network__refuses_weights_in_another_file(tmp_path):
@@ -99,7 +101,7 @@ def test_weights_file__names_the_missing_extra(monkeypatch):
 
     monkeypatch.setattr("sat_intervals.config.weights.files", nowhere)
     with pytest.raises(SatIntervalsError, match=r"needs the package MCCNN: pip install 'sat-intervals\[mccnn\]'"):
-        weights_file(None)
+        weights_file("full")
 
 
 def test_network__names_the_missing_onnxruntime(network_file, monkeypatch):

@@ -291,6 +291,19 @@ def test_page__of_a_thin_image_has_a_map_to_click_on(browser, tmp_path, shape):
     assert page.complaints() == []
 
 
+def test_page__draws_the_offsets_of_the_rows(browser, tmp_path):
+    out = write_run(tmp_path, *random_bands(60, 80))
+    report = json.loads((out / "run.json").read_text())
+    looks = [[10, 20, 1.25, -0.05], [40, 60, 1.5, 0.1]]
+    report |= {"survey": {"rows": {"before": [1.4, 1.5], "after": [0.08, 0.1], "looks": looks}}, "rows": {"coefficients": [1.4], "rows": 60, "columns": 80}}
+    (out / "run.json").write_text(json.dumps(report))
+    page = Page(browser, write_report(open_results(out)))
+    words = page.text("#search").replace("\u2212", "-")
+    assert "differ by 1.40 px in the median, 0.08 px after they were moved" in words
+    assert {"1.25", "-0.05", "1.50", "0.10"} <= set(words.split())
+    assert page.complaints() == []
+
+
 @pytest.mark.parametrize("width", [500, 1280])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_page__fits_the_window_and_reads_in_light_and_dark(page, width, scheme):

@@ -124,11 +124,32 @@ function showSearch() {
     `${percent(ends.minimum / valid)} are within 1 px of the minimum and ${percent(ends.maximum / valid)} of the maximum.`));
   const rows = [
     ["distance of matches, 1 = random pixels", quality.noise === null ? "none" : fixed(quality.noise, 2)],
-    ["offset of the rows", quality.row_offset === null ? "none" : `${fixed(quality.row_offset, 1)} px`],
+    ["rows of the two images", run.survey?.rows ? rowsSentence(run.survey.rows) : "not compared"],
     ...Object.entries(quality.collars).map(([side, collar]) => [`border of the ${side} image`, `${percent(collar.share)} of its pixels are ${short(collar.value)}`]),
     ...warnings.map((line) => ["warning", line]),
   ];
   place.append(table([], rows));
+  if (run.survey?.rows) showRows(place, run.survey.rows);
+}
+
+function rowsSentence({ before: [median], after: [left] }) {
+  const moved = run.rows ? `, ${fixed(left, 2)} px after they were moved` : "";
+  return `differ by ${fixed(median, 2)} px in the median${moved}`;
+}
+
+/** Draw the row offsets of the places that were compared, and what the function leaves of them, as numbers. */
+function showRows(place, { looks }) {
+  const done = run.rows ? "taken out of the right image" : "left as they are";
+  const figures = [[2, `Row offset (px), ${done}`], [3, "What a smooth function leaves of it (px)"]].map(([part, title]) => {
+    const figure = element("figure", {}, element("h3", {}, title));
+    drawing(figure, 260, title, (width) => {
+      const { width: across, height } = run.inputs.right;
+      const { x, y, parts } = chart(width, 260, [0, across], [height, 0], { across: "column", up: "row", up_ticks: ticks(0, height, 5) });
+      return [...parts, ...looks.map((look) => svg("text", { x: x(look[1]), y: y(look[0]) + 4, "text-anchor": "middle" }, fixed(look[part], 2)))];
+    });
+    return figure;
+  });
+  place.append(element("div", { class: "pair" }, ...figures));
 }
 
 function showTiles() {
