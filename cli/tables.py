@@ -92,6 +92,8 @@ def show_scene(scene: SceneMetrics) -> None:
     click.echo(_nominal_line(report))
     bad = [_figure(report[name]) for name in ("bad1", "bad3")]
     click.echo(f"disparity wrong by more than 1 px: {bad[0]}, by more than 3 px: {bad[1]}")
+    if report["locking"] is not None:
+        click.echo(f"locking to whole pixels, share of the variance of errors up to 1 px: {_figure(report['locking'])}")
     if report["tolerance"]:
         click.echo(f"truth up to {report['tolerance']:g} px outside an interval counts as inside")
     if report["bias"] is not None:
@@ -187,8 +189,9 @@ def show_calibration(calibration: "Calibration", expected: Sequence[dict[str, fl
     rows = []
     for row, levels in zip(expected, calibration.levels, strict=True):
         quantile = "none" if levels.quantile is None else f"{levels.quantile:g}"
-        rows.append([f"{levels.coverage:g}", *_expected(row), f"{levels.high:.1f}", f"{levels.low:.1f}", quantile])
-    header = ["coverage", *_EXPECTED, "level high", "level low", "quantile"]
+        rows.append([f"{levels.coverage:g}", *_expected(row), f"{levels.high:.4g}", f"{levels.low:.1f}", quantile])
+    is_factor = (calibration.key["refinement"] or {}).get("method") == "least_squares"
+    header = ["coverage", *_EXPECTED, "factor high" if is_factor else "level high", "level low", "quantile"]
     show(header, rows, "expected: coverage, widths and score (px) of pairs left out, and levels")
     for note in calibration.provenance["notes"]:
         click.echo(note)

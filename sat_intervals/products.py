@@ -90,6 +90,9 @@ BANDS = (
     Band("confidence", "", "confidence from ambiguity, 0 to 1, high = unambiguous"),
 )
 
+# A fifth band, if it is asked for.
+SIGMA = Band("sigma", "px", "standard deviation of the least-squares fit of the disparity, no data without one")
+
 
 class Bands(NamedTuple):
     """Results of a run for some pixels, with truth and left image where they were read; all ``(rows, columns)``."""
@@ -101,6 +104,7 @@ class Bands(NamedTuple):
     validity: np.ndarray  # uint16 flags
     truth: np.ndarray = np.empty((0, 0))  # true disparity in pixels, floats, NaN where unknown; empty if not read
     image: np.ndarray = np.empty((0, 0))  # grey values of the left image, floats, NaN where no data; empty if not read
+    sigma: np.ndarray = np.empty((0, 0))  # float32 pixels, NaN without a fit; empty if not asked for
 
     @property
     def valid(self) -> np.ndarray:

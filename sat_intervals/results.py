@@ -76,7 +76,7 @@ class Run:
 
     def read_bands(self, window: Window) -> Bands:
         """Read the bands of a window of the results."""
-        return Bands(*(band for name in _BANDS for band in read_layers(self.out / name, window)))
+        return Bands(*(band for name, n in _BANDS.items() for band in read_layers(self.out / name, window)[:n]))
 
     def windows(self) -> Iterator[Window]:
         """Yield full-width windows of the results from the top."""
@@ -127,7 +127,7 @@ class Results(Run):
     def read_pixel(self, row: int, column: int) -> Bands:
         """Read bands, left image and truth of one pixel as zero-dimensional arrays."""
         self.check_pixel(row, column)
-        return Bands(*(band[0, 0] for band in self.read(Window(row, column, 1, 1))))
+        return Bands(*(band[0, 0] for band in self.read(Window(row, column, 1, 1))[:-1]))  # not sigma
 
     def strips(self) -> Iterator[tuple[int, Bands]]:
         """Yield the first row and the content (see `read`) of each strip, from the top."""
@@ -135,7 +135,7 @@ class Results(Run):
 
     def read_small(self, shape: tuple[int, int]) -> Bands:
         """Read all bands and the left image at ``shape`` pixels: bands subsampled, the image averaged; no truth."""
-        bands = Bands(*(band for name in _BANDS for band in read_small_layers(self.out / name, shape)))
+        bands = Bands(*(band for name, n in _BANDS.items() for band in read_small_layers(self.out / name, shape)[:n]))
         return bands._replace(image=read_small_image(self.left, self.region, shape))
 
     def read_small_left(self, window: Window, shape: tuple[int, int]) -> np.ndarray:
@@ -179,7 +179,9 @@ def open_run(out: str | Path) -> Run:
     except ValueError as error:
         where = ", see " + ".".join(map(str, error.errors()[0]["loc"])) if isinstance(error, ValidationError) else ""
         raise SatIntervalsError(f"{file} is not the report of a run{where}: match again with --overwrite") from error
-    places = [_place(file.with_name(name), (bands, region.height, region.width)) for name, bands in _BANDS.items()]
+    more = {"intervals.tif": config.products.sigma}
+    needed = {name: (bands + more.get(name, 0), region.height, region.width) for name, bands in _BANDS.items()}
+    places = [_place(file.with_name(name), shape) for name, shape in needed.items()]
     return Run(file.parent, report, config, region, places[-1])
 
 

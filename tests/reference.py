@@ -555,6 +555,65 @@ def match_arrays(left, right, left_state, right_state, config):
     return SimpleNamespace(disparity=disparity, lower=lower, upper=upper, confidence=confidence, validity=flags)
 
 
+# ---- Least squares -----------------------------------------------------------------------------------------
+def cubic(t):
+    """Keys' kernel with a = -1/2."""
+    t = np.abs(t)
+    return np.where(t <= 1, (1.5 * t - 2.5) * t * t + 1, np.where(t < 2, ((-0.5 * t + 2.5) * t - 4) * t + 2, 0))
+
+
+def facing_value(row, place):
+    """Section 19: value and derivative of a row of the right image at a place; NaN at no data."""
+    near = int(np.floor(place)) + np.arange(-1, 3)
+    along = (8 * (row[near + 1] - row[near - 1]) - row[near + 2] + row[near - 2]) / 12
+    return cubic(place - near) @ row[near], cubic(place - near) @ along
+
+
+def around(shape, r, c, radius=2):
+    """Window of a pixel inside an image, as indices, and its rows and columns from the pixel."""
+    rows, columns = np.mgrid[r - radius : r + radius + 1, c - radius : c + radius + 1]
+    inside = (rows >= 0) & (rows < shape[0]) & (columns >= 0) & (columns < shape[1])
+    return (rows[inside], columns[inside]), rows[inside] - r, columns[inside] - c
+
+
+def fit(left, value, slope, disparity, r, c):
+    """Section 19: shift and standard deviation of the least-squares fit of one pixel; NaN for none."""
+    nothing = np.nan, np.nan
+    if not np.isfinite([left[r, c], value[r, c], disparity[r, c]]).all():
+        return nothing
+    window, _, _ = around(left.shape, r, c)
+    b, v, g = (image[window].astype(np.float64) for image in (left, value, slope))
+    told = (np.abs(disparity[window] - disparity[r, c]) <= 1) & np.isfinite(b) & np.isfinite(v)
+    if told.sum() < 6:
+        return nothing
+    b, v, g = b[told] - left[r, c], v[told] - value[r, c], g[told]
+    design = np.stack([v, g, np.ones_like(v)], axis=1)
+    centred = design[:, :2] - design[:, :2].mean(axis=0)
+    (vv, vg), (_, gg) = centred.T @ centred
+    if not (vv > 0 and vv * gg - vg**2 > 1e-5 * vv * gg):
+        return nothing
+    found, *_ = np.linalg.lstsq(design, b, rcond=None)
+    gain, moved, _ = found
+    if gain <= 0.1 or abs(moved) > gain:
+        return nothing
+    variance = ((b - design @ found) ** 2).sum() / (told.sum() - 3)
+    variance *= np.linalg.inv(design.T @ design)[1, 1] / gain**2
+    return moved / gain * 0.0625 / (0.0625 + variance), np.sqrt(variance)
+
+
+def on_plane(disparity, deviation, r, c):
+    """Section 19: the middle of the plane through the disparities around a pixel with a fit."""
+    if np.isnan(deviation[r, c]):
+        return disparity[r, c]
+    window, down, across = around(disparity.shape, r, c)
+    x = disparity[window].astype(np.float64) - disparity[r, c]
+    told = np.abs(x) <= 0.75
+    weight = 1 / (np.nan_to_num(deviation[window][told].astype(np.float64), nan=1.0) ** 2 + 0.01)
+    design = np.stack([np.ones(told.sum()), down[told], across[told]], axis=1)
+    matrix = design.T @ (weight[:, np.newaxis] * design) + 1e-3 * weight.sum() * np.diag([0, 1, 1])
+    return disparity[r, c] + np.linalg.solve(matrix, design.T @ (weight * x[told]))[0]
+
+
 # ---- Inputs for the tests ----------------------------------------------------------------------------------
 def patch_pair(seed, rows, columns, count, window, style="shifted"):
     """A padded pair of patches with few grey levels, so that ties abound: float32 pixels, no states yet.

@@ -65,6 +65,8 @@ def figures(scene, rules, judged, bias):
     }
     over = [1 - worst[p] / width[p] for p in judged if low[p] and width[p] > 0]
     report["low"]["relative_overestimation"] = middle(over)
+    small = {p: float(scene.disparity[p]) - truth[p] for p in judged if error[p] <= 1}
+    report["locking"] = locking({p: truth[p] for p in small}, small)
     report["deciles"] = deciles(scene.confidence, judged, inside, width)
     return report
 
@@ -78,6 +80,17 @@ def area_errors(low, error, depth):
         errors = [error[p] for p in area if p in error]
         worst |= {p: max(errors) for p in run if errors}
     return worst
+
+
+def locking(truth, error):
+    """One less the variance of errors within sixteenths of the truth's fraction, over all of it."""
+    groups = {}
+    for p, value in error.items():
+        groups.setdefault(int(16 * (truth[p] % 1)) % 16, []).append(value)
+    if len(groups) < 2 or np.var(list(error.values())) == 0:
+        return None
+    within = sum(len(group) * np.var(group) for group in groups.values())
+    return 1 - within / (len(error) * np.var(list(error.values())))
 
 
 def deciles(confidence, judged, inside, width):

@@ -26,8 +26,8 @@ class Sgm(_Penalties):
     """Constant penalties."""
 
     penalty: Literal["constant"] = Field("constant", description="the same everywhere, or mc_cnn_fast with mccnn")
-    p1: Exact = Field(Decimal(28), gt=0, description="penalty of a disparity step of one pixel; whole with census")
-    p2: Exact = Field(Decimal(128), gt=0, description="penalty of a larger step, at least p1; whole with census")
+    p1: Exact = Field(Decimal(24), gt=0, description="penalty of a disparity step of one pixel; whole with census")
+    p2: Exact = Field(Decimal(144), gt=0, description="penalty of a larger step, at least p1; whole with census")
     span: Exact | None = Field(
         None, gt=0, description="span of the aggregated cost, for etas and alpha; with census it follows from p2"
     )

@@ -192,7 +192,9 @@ class Ambiguity(Section):
 class Refinement(Section):
     """Sub-pixel refinement of the disparity."""
 
-    method: Literal["vfit"] = Field("vfit", description="symmetric V through the winner's cost and its neighbours")
+    method: Literal["least_squares", "vfit"] = Field(
+        "least_squares", description="V through the winner's cost and its neighbours, or grey values as well"
+    )
 
 
 class CrossCheck(Section):
@@ -276,4 +278,5 @@ class Products(Section):
     """Content of the output bands."""
 
     keep_rejected: bool = Field(False, description="write values of pixels rejected by cross-checking")
+    sigma: bool = Field(False, description="write the standard deviations of least squares as a fifth band")
     compression: Literal["deflate", "zstd"] = Field("deflate", description="of the files")

@@ -33,6 +33,7 @@ from sat_intervals.config.weights import weights_file
 from sat_intervals.products import BOUND_STEPS, IMPOSSIBLE_COST
 
 SGM_PATHS = 8
+_CUT = 0.2  # of the span
 
 
 class Config(Section):
@@ -84,6 +85,8 @@ class Config(Section):
                 "interval has a coverage and regularization null, but calibrations are for two "
                 "classes of confidence, which it makes: give regularization, or alpha instead of the coverage"
             )
+        if self.products.sigma and not self.fits:
+            raise ValueError("products.sigma needs refinement.method least_squares: give it, or set sigma to false")
         if self.disparity.is_local and self.cross_check and self.cross_check.method == "accurate":
             raise ValueError(
                 "disparity has local ranges, which cross_check.method accurate does not know: use fast, or one range"
@@ -190,6 +193,16 @@ class Config(Section):
         given = self.interval.calibration
         calibration = given if isinstance(given, Calibration) else built_in(key_of(self), self.preset)
         return at(calibration, float(self.interval.coverage))
+
+    @property
+    def fit_cut(self) -> float:
+        """Return the level of the cut that intervals of least squares are made from, that of possibility .8."""
+        return _CUT * self.cost_span
+
+    @property
+    def fits(self) -> bool:
+        """Return whether disparities are refined by least squares."""
+        return self.refinement is not None and self.refinement.method == "least_squares"
 
     @property
     def has_coverage(self) -> bool:

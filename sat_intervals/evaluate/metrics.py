@@ -13,6 +13,7 @@ from sat_intervals.products import Bands
 
 _WIDTH, _RATIO, _CONFIDENCE = 100, 1000, 1000  # steps a unit
 _LARGEST_RATIO = 100
+_FRACTIONS = 16  # of a pixel
 
 
 @dataclass(frozen=True)
@@ -96,6 +97,28 @@ class _Deciles:
         ]
 
 
+class _Locking:
+    """Share of the variance of small errors that the fraction of the true disparity explains."""
+
+    def __init__(self) -> None:
+        self._count, self._sum, self._squares = np.zeros((3, _FRACTIONS))
+
+    def add(self, error: np.ndarray, truth: np.ndarray) -> None:
+        near = np.abs(error) <= 1
+        place = (truth[near] % 1 * _FRACTIONS).astype(np.int64) % _FRACTIONS
+        for total, weights in ((self._count, None), (self._sum, error[near]), (self._squares, error[near] ** 2)):
+            total += np.bincount(place, weights, _FRACTIONS)
+
+    def report(self) -> float | None:
+        """Return the share; None if all truths have one fraction."""
+        known = self._count > 0
+        if known.sum() < 2:
+            return None
+        count, total = self._count.sum(), self._sum.sum()
+        between = (self._sum[known] ** 2 / self._count[known]).sum() - total**2 / count
+        return share(between, self._squares.sum() - total**2 / count)
+
+
 class Metrics:
     """Figures of merit of a set of pixels."""
 
@@ -105,7 +128,7 @@ class Metrics:
             name: Intervals(criteria.maximum - criteria.minimum, criteria.nominal) for name in ("all", "high", "low")
         }
         self._ratios = Histogram(0, _LARGEST_RATIO, _RATIO)
-        self._deciles = _Deciles()
+        self._deciles, self._locking = _Deciles(), _Locking()
         self._wrong = {"bad1": 0, "bad3": 0, "truth_outside_range": 0}
 
     def add(self, bands: Bands, low: np.ndarray, area_error: np.ndarray) -> None:
@@ -114,7 +137,7 @@ class Metrics:
         ``low`` is low confidence (paper eq. 13), ``area_error`` the largest ``|truth - disparity|`` over the evaluated
         pixels of its area, NaN if not low.
         """
-        disparity, lower, upper, confidence, _, truth, _ = bands
+        disparity, lower, upper, confidence, _, truth, *_ = bands
         criteria = self._criteria
         lowest, highest, width = lower - criteria.tolerance, upper + criteria.tolerance, upper - lower
         missed = np.maximum(np.maximum(lowest - truth, truth - highest), 0)
@@ -124,6 +147,7 @@ class Metrics:
         self._ratios.add(area_error[wide] / width[wide])
         self._deciles.add(confidence, missed == 0, width)
         error = np.abs(disparity - truth)
+        self._locking.add(disparity - truth, truth)
         self._wrong["bad1"] += int((error > 1).sum())
         self._wrong["bad3"] += int((error > 3).sum())
         self._wrong["truth_outside_range"] += int(((truth < criteria.minimum) | (truth > criteria.maximum)).sum())
@@ -139,7 +163,7 @@ class Metrics:
         report["low"]["relative_overestimation"] = None if ratio is None else 1 - ratio  # paper eq. 16
         for name, count in self._wrong.items():
             report[name] = share(count, report["all"]["count"])
-        return report | {"deciles": self._deciles.report()}
+        return report | {"locking": self._locking.report(), "deciles": self._deciles.report()}
 
 
 def share(part: float, whole: float) -> float | None:

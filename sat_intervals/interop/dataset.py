@@ -11,7 +11,7 @@ from xarray.core import indexing
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import FLAGS, INVALID, flag_attributes
-from sat_intervals.raster import RUN_FILES, grid_mapping, read_layers
+from sat_intervals.raster import grid_mapping, read_layers, run_files
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
 
@@ -68,7 +68,8 @@ def open(out: str | Path, chunks: int | None = 2048) -> xr.Dataset:
     dataset.attrs = {"title": "disparity with intervals", "source": "sat-intervals", "finished": run.report["finished"]}
     if run.config.preset:
         dataset.attrs["preset"] = run.config.preset
-    for file in RUN_FILES:
+    products = run.config.products
+    for file in run_files(products.compression, sigma=products.sigma):
         for number, band in enumerate(file.bands, start=1):
             lazy = indexing.LazilyIndexedArray(_Layer(run, file.name, number, file.dtype))
             attributes = {"long_name": band.meaning} | ({"units": band.unit} if band.unit else {})

@@ -63,7 +63,7 @@ def _terms(v: np.ndarray, u: np.ndarray) -> Iterator[np.ndarray]:
 
 
 @inlined
-def _weights(t):
+def cubic_weights(t):
     """Weights of the four pixels around a position, and their derivatives; ``t`` is from the second one."""
     values = (
         ((-0.5 * t + 1) * t - 0.5) * t,
@@ -88,7 +88,7 @@ def shift_rows(pixels, state, whole, part):
     result, states = np.zeros((rows, columns), pixels.dtype), np.zeros((rows, columns), np.uint8)
     for r in range(rows):
         for c in range(columns):
-            weights, _ = _weights(part[r, c])
+            weights, _ = cubic_weights(part[r, c])
             value = 0.0
             for k in range(4):
                 if weights[k] != 0:
@@ -126,7 +126,7 @@ def shift_equations(left, right, disparity, known, offset, step, radius):
             if i < 1 or j < 1 or i + 3 > right.shape[0] or j + 3 > right.shape[1]:
                 told[r, c] = False
                 continue
-            (down, down_slope), (across, across_slope) = _weights(y - i), _weights(x - j)
+            (down, down_slope), (across, across_slope) = cubic_weights(y - i), cubic_weights(x - j)
             value = along_columns = along_rows = 0.0
             for a in range(4):
                 line = slope = 0.0

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sat_intervals.config.calibration import Levels
-from sat_intervals.match.measurement import COUNTS, HIGH, INSIDE, MISSED, QUANTILES, WIDTH, WIDTHS, Measured
+from sat_intervals.match.measurement import COUNTS, HIGH, INSIDE, MISSED, QUANTILES, WIDTH, WIDTHS, Ladders, Measured
 
 _USUAL_QUANTILE = 0.9
 # Of quantiles whose scores differ by less than this, the one with the narrowest intervals is chosen.
@@ -36,35 +36,36 @@ def pooled(parts: Iterable[Measured]) -> Pool:
     return Pool(np.asarray(sum(part.weight * part.table for part in parts)), (int(high), int(low)))
 
 
-def choose(pool: Pool, levels: np.ndarray, coverage: float) -> tuple[Levels, list[str]]:
+def choose(pool: Pool, ladders: Ladders, coverage: float) -> tuple[Levels, list[str]]:
     """Choose the levels with which each class reaches a coverage.
 
     Of the quantiles whose interval score is nearly the best, the one with the narrowest intervals is chosen. A class
     with fewer pixels than the larger of 200 and ``10 / (1 - coverage)`` takes the level of the other class: high
     confidence that of low confidence without regularisation, low confidence that of high with the usual quantile. If
-    both have few, each keeps its own.
+    both have few, or with least squares, each keeps its own.
 
     Returns the levels, and what a reader must know: a class with few pixels, or a coverage that no level reaches.
     """
-    (table, pixels), notes = pool, []
+    (table, pixels), notes = pool, list[str]()
     needed = ceil(max(200, 10 / (1 - coverage)) - 1e-9)
     few = [number < needed for number in pixels]
+    borrows = ladders.are_one and not all(few)
     for name, other, number in zip(("high", "low"), ("low", "high"), pixels, strict=True):
         if number < needed:
-            borrowed = "" if all(few) else f": the level of {other} confidence is used"
+            borrowed = f": the level of {other} confidence is used" if borrows else ""
             notes.append(f"{number} pixels of {name} confidence, {needed} are needed{borrowed}")
-    high = _level(table[:, HIGH + (few[0] and not few[1])], levels, coverage)
+    high = _level(table[:, HIGH + (few[0] and borrows)], ladders.high, coverage)
     if high is None:
         notes.append("high confidence does not reach it at any level")
-    most = float(levels[-1])
+    most = float(ladders.low[-1])
     low: tuple[float, float | None] | None
-    if few[1] and not few[0]:
+    if few[1] and borrows:
         low = most if high is None else high, _USUAL_QUANTILE
-    elif (low := _best(table, levels, coverage)) is None:
+    elif (low := _best(table, ladders.low, coverage)) is None:
         notes.append("low confidence does not reach it at any level")
     reached = high is not None and low is not None
     level, quantile = low or (most, QUANTILES[int(np.argmax(table[-1, HIGH + 1 :, INSIDE]))])  # it comes nearest
-    high = most if high is None else high
+    high = float(ladders.high[-1]) if high is None else high
     return Levels(coverage=coverage, high=high, low=level, quantile=quantile, reached=reached), notes
 
 
@@ -132,14 +133,14 @@ def interval_score(fields: np.ndarray, coverage: float) -> float:
     return float((fields[WIDTH] + 2 / (1 - coverage) * fields[MISSED]) / pixels)
 
 
-def expected(table: np.ndarray, ladder: np.ndarray, levels: Levels) -> dict[str, float]:
+def expected(table: np.ndarray, ladders: Ladders, levels: Levels) -> dict[str, float]:
     """Figures with given levels: coverage of all, high and low, widths in pixels, interval score; NaN without pixels.
 
     ``table`` is that of a `Pool`.
     """
     assert levels.coverage is not None
-    high = at_level(table[:, HIGH], ladder, levels.high)
-    low = at_level(table[:, HIGH + 1 + QUANTILES.index(levels.quantile)], ladder, levels.low)
+    high = at_level(table[:, HIGH], ladders.high, levels.high)
+    low = at_level(table[:, HIGH + 1 + QUANTILES.index(levels.quantile)], ladders.low, levels.low)
     both = high + low
     if not both[COUNTS:].sum():
         return dict.fromkeys(("all", "high", "low", "mean_width", "median_width", "score"), np.nan)
@@ -158,7 +159,7 @@ def _share(fields: np.ndarray, which: int) -> float:
 
 
 def left_out(
-    parts: Sequence[Measured], levels: np.ndarray, coverages: Iterable[float]
+    parts: Sequence[Measured], ladders: Ladders, coverages: Iterable[float]
 ) -> list[dict[str, dict[str, float]]]:
     """For each coverage, figures of each group, see `expected`, with the levels chosen on the others.
 
@@ -168,7 +169,7 @@ def left_out(
     own = {group: pooled(part for part in parts if part.group == group).table for group in groups}
     rest = {group: pooled(part for part in parts if part.group != group) for group in groups if len(groups) > 1}
     return [
-        {group: expected(own[group], levels, choose(others, levels, coverage)[0]) for group, others in rest.items()}
+        {group: expected(own[group], ladders, choose(others, ladders, coverage)[0]) for group, others in rest.items()}
         for coverage in coverages
     ]
 

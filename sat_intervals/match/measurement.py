@@ -20,6 +20,8 @@ HIGH, SCHEMES = 0, 1 + len(QUANTILES)
 # Rungs: level 0, and from a fraction of the span to the level that holds every candidate, each 1.26 times the
 # one before.
 _LOWEST, _RUNGS = 1 / 256, 25
+# Factors of the same number of rungs, and the last one.
+_FACTORS, _ALL = (1 / 16, 64), 6e4
 # Widths are counted in steps of 1/64 px up to 8 px, and of 1 % above.
 _STEPS, _FINE, _RATIO = 64, 8, 1.01
 _COARSE = ceil(np.log(32000 / _FINE) / np.log(_RATIO)) + 1
@@ -54,10 +56,29 @@ class Measured(NamedTuple):
         return int(self.table[0, [HIGH, HIGH + 1], COUNTS:].sum())
 
 
-def ladder(config: Config) -> np.ndarray:
-    """Levels at which pairs are matched: ascending float64, the last holds every possible candidate."""
-    levels = np.geomspace(config.cost_span * _LOWEST, config.largest_sum, _RUNGS)
-    return np.concatenate([[0.0], levels])
+class Ladders(NamedTuple):
+    """Rungs of both classes, ascending float64 ``(rungs,)``: the last ones hold every possible candidate.
+
+    low: levels at which pairs are matched.
+    high: the same; with least squares factors of intervals, see `refinement.both`.
+    """
+
+    high: np.ndarray
+    low: np.ndarray
+
+    @property
+    def are_one(self) -> bool:
+        """Return whether a rung of one class has a meaning for the other."""
+        return self.high is self.low
+
+
+def ladders(config: Config) -> Ladders:
+    """Return the rungs that intervals of some settings are measured at."""
+    levels = np.concatenate([[0.0], np.geomspace(config.cost_span * _LOWEST, config.largest_sum, _RUNGS)])
+    if not config.fits:
+        return Ladders(levels, levels)
+    factors = np.geomspace(_FACTORS[0], _FACTORS[1], _RUNGS - 1)
+    return Ladders(np.concatenate([[0.0], factors, [_ALL]]), levels)
 
 
 def measure(

@@ -17,6 +17,8 @@ _VIEW_BYTES = 20
 # Pixels of a piece of a strip, in whole rows, and bytes for each: raw products, final bands and temporary arrays.
 STRIP_PIXELS = 1 << 19
 _PIECE_BYTES, _PIECE_ROWS = 100, 64
+# With least squares: more temporary arrays, and per pixel of a strip the pixels of both images.
+_FIT_BYTES, _IMAGES_BYTES = 60, 8
 # Per pixel of a strip: final bands, which are compressed one file after another; and per pixel of the columns that are
 # compressed at a time: what is written, read back and compared.
 _BAND_BYTES, _BLOCK_BYTES, _COLUMNS = 18, 64, 2048
@@ -70,10 +72,12 @@ def waiting_bytes(config: Config, size: int | None = None) -> int:
     return _VIEW_BYTES * side * (side + config.disparity.count) + _CORE_BYTES * size**2
 
 
-def strip_bytes(rows: int, width: int) -> int:
+def strip_bytes(rows: int, width: int, config: Config) -> int:
     """Bytes that finishing a strip of final rows needs on top of its process."""
-    piece = _PIECE_BYTES * max(STRIP_PIXELS, _PIECE_ROWS * width)
+    piece = (_PIECE_BYTES + config.fits * _FIT_BYTES) * max(STRIP_PIXELS, _PIECE_ROWS * width)
     bands = rows * width * _BAND_BYTES
+    if config.fits:
+        bands += rows * _IMAGES_BYTES * (width + config.disparity.count)
     return bands + max(piece, bands // 2 + rows * min(width, _COLUMNS) * _BLOCK_BYTES)
 
 
@@ -90,9 +94,9 @@ def fitted(config: Config, memory: int, tiles_at_once: int = 1, waiting: int = 0
     )
 
 
-def check_strips(rows: int, width: int, memory: int, strips_at_once: int = 1) -> None:
+def check_strips(rows: int, width: int, config: Config, memory: int, strips_at_once: int = 1) -> None:
     """Raise if ``strips_at_once`` strips of final rows do not fit in a process of ``memory`` bytes."""
-    needed = PROCESS_BYTES + strips_at_once * strip_bytes(rows, width)
+    needed = PROCESS_BYTES + strips_at_once * strip_bytes(rows, width, config)
     if needed > memory:
         raise ConfigError(
             f"strips of {rows} x {width} pixels, {strips_at_once} at once, need {needed / 1e6:.0f} MB, but "

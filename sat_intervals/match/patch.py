@@ -70,7 +70,7 @@ def kernel_settings(config: Config) -> Settings:
         cut_level=-1 if config.cut_level is None else config.cut_level,
         weights=np.zeros(0, np.uint16) if config.ambiguity_weights is None else config.ambiguity_weights,
         refine=config.refinement is not None,
-        high=cuts.high if cuts else -1.0,
+        high=(config.fit_cut if config.fits else cuts.high) if cuts else -1.0,
         low=cuts.low if cuts else -1.0,
         steps=config.bound_steps,
     )

@@ -1,7 +1,8 @@
 """Whole-image steps on raw products: cross-checking, confidence, medians, regularisation, final bands.
 
 All steps work on full-width rows with a halo of rows above and below, so that results do not depend on the tiling
-(METHOD.md, sections 4 and 6 to 9). The order is: winner and V-fit (in the tile), cross-check, median, quantiles,
+(METHOD.md, sections 4 and 6 to 9). The order is: winner and V-fit (in the tile), cross-check, median, least
+squares, quantiles,
 widening, NaN for invalid pixels.
 """
 
@@ -16,6 +17,7 @@ from sat_intervals.kernels.disparity import cross_check, median
 from sat_intervals.kernels.intervals import regularize
 from sat_intervals.kernels.matching import Raw, RightView
 from sat_intervals.match.histogram import quantile
+from sat_intervals.match.refinement import HALO, Refined, both, pixels_of, refined
 from sat_intervals.products import (
     BOUND_STEPS,
     INVALID,
@@ -26,6 +28,7 @@ from sat_intervals.products import (
     REGULARIZED,
     Bands,
 )
+from sat_intervals.tiling import Views
 
 # Steps per pixel in which sub-pixel bounds are regularised.
 _STEPS = 8
@@ -43,6 +46,7 @@ class RawRows(NamedTuple):
     validity: uint16 flags.
     right_winner: ``(rows, columns + count - 1)`` int16, see `RightView`.
     lower_low, upper_low: bounds of low-confidence pixels, see `Raw`; empty for bounds in whole pixels.
+    left, right: pixels of both images, see `refinement.pixel_windows`; empty without least squares.
     """
 
     winner: np.ndarray
@@ -54,17 +58,25 @@ class RawRows(NamedTuple):
     right_winner: np.ndarray
     lower_low: np.ndarray = _EMPTY
     upper_low: np.ndarray = _EMPTY
+    left: np.ndarray = _EMPTY
+    right: np.ndarray = _EMPTY
 
     @classmethod
     def of(cls, raw: Raw, right: RightView) -> "RawRows":
         """Make the rows of a pair that was matched as one tile."""
-        return cls(
-            **{name: getattr(raw, name) for name in cls._fields if name != "right_winner"}, right_winner=right.winner
-        )
+        return cls(**{name: getattr(raw, name) for name in raw._fields if name != "cost"}, right_winner=right.winner)
+
+    def with_pixels(self, views: Views) -> "RawRows":
+        """Add the pixels of both images."""
+        left, right = pixels_of(views)
+        return self._replace(left=left, right=right)
 
 
 class Filtered(NamedTuple):
-    """Rows before regularisation: bands with their halo, low-confidence pixels (None without), pixels to write."""
+    """Rows before regularisation: bands with their halo, low-confidence pixels (None without), pixels to write.
+
+    deviation: of the fits of least squares, see `Refined`; empty without.
+    """
 
     disparity: np.ndarray
     lower: np.ndarray
@@ -73,6 +85,11 @@ class Filtered(NamedTuple):
     validity: np.ndarray
     low: np.ndarray | None
     written: np.ndarray
+    deviation: np.ndarray
+
+    def fits(self, inner: slice) -> Refined:
+        """Return disparities and deviations of some rows."""
+        return Refined(self.disparity[inner], self.deviation[inner])
 
 
 class ConfidenceScale(NamedTuple):
@@ -99,7 +116,7 @@ def confidence_scale(settings: Ambiguity, histogram: np.ndarray) -> ConfidenceSc
 def halo(config: Config) -> int:
     """Number of rows above and below that the final bands of a row depend on."""
     radius = config.median.size // 2 if config.median else 0
-    return radius + (config.regularization.depth if config.regularization else 0)
+    return radius + max(config.regularization.depth if config.regularization else 0, HALO if config.fits else 0)
 
 
 def postprocess_rows(rows: RawRows, first: int, last: int, scale: ConfidenceScale, config: Config) -> Bands:
@@ -124,13 +141,14 @@ def filter_rows(rows: RawRows, scale: ConfidenceScale, config: Config) -> Filter
     low = None
     if config.regularization:
         low = low_confidence(confidence, config.regularization.threshold, config.regularization.kernel)
-    disparity, (lower, upper) = rows.disparity, _bounds(rows, low, config)
+    disparity, (lower, upper) = rows.disparity, _bounds(rows, low, kept, config)
     if config.median:
         disparity = median(disparity, kept, config.median.size)
-        if config.interval:
-            lower, upper = median(lower, kept, config.median.size), median(upper, kept, config.median.size)
+    deviation = _EMPTY
+    if config.fits:
+        disparity, deviation = refined(disparity, kept, rows.left, rows.right, config.disparity.minimum)
     written = searched if config.products.keep_rejected else kept
-    return Filtered(disparity, lower, upper, confidence, validity, low, written)
+    return Filtered(disparity, lower, upper, confidence, validity, low, written, deviation)
 
 
 def finish_rows(rows: Filtered, first: int, last: int, config: Config) -> Bands:
@@ -142,8 +160,13 @@ def finish_rows(rows: Filtered, first: int, last: int, config: Config) -> Bands:
         lower, upper = regularized(rows, first, last, config, cuts.quantile if cuts else config.regularization.quantile)
         assert rows.low is not None
         validity[rows.low[inner]] |= REGULARIZED
+    if config.fits and cuts:
+        assert rows.low is not None  # a coverage needs both classes
+        bounds = both(rows.fits(inner), rows.lower[inner], rows.upper[inner], cuts.high, config)
+        lower, upper = (np.where(rows.low[inner], old, new) for new, old in zip(bounds, (lower, upper), strict=True))
     disparity = np.where(rows.written[inner], rows.disparity[inner], np.float32(np.nan))
-    return Bands(disparity, *widened(lower, upper, disparity, config), rows.confidence[inner], validity)
+    bands = Bands(disparity, *widened(lower, upper, disparity, config), rows.confidence[inner], validity)
+    return bands._replace(sigma=rows.deviation[inner]) if config.products.sigma else bands
 
 
 def widened(
@@ -171,24 +194,32 @@ def _open_ends(rows: RawRows, validity: np.ndarray, confidence: np.ndarray, conf
         validity[ends] |= np.where(below[ends], OPEN_BELOW, OPEN_ABOVE).astype(validity.dtype)
 
 
-def _bounds(rows: RawRows, low: np.ndarray | None, config: Config) -> tuple[np.ndarray, np.ndarray]:
-    """Both bounds in pixels as float32, of the level of each pixel's class.
+def _bounds(rows: RawRows, low: np.ndarray | None, kept: np.ndarray, config: Config) -> tuple[np.ndarray, np.ndarray]:
+    """Both bounds in pixels as float32, of the level of each pixel's class, after the median.
 
-    Values where nothing was searched are never written.
+    With least squares the cuts of the two classes differ much, so each is filtered on its own. Values where nothing was
+    searched are never written.
     """
     if config.interval is None:
         nothing = np.full(rows.lower.shape, np.float32(np.nan))
         return nothing, nothing
-    lower, upper, steps = rows.lower, rows.upper, config.bound_steps
-    if low is not None and steps:
-        lower, upper = np.where(low, rows.lower_low, lower), np.where(low, rows.upper_low, upper)
-    lower, upper = lower.astype(np.float32), upper.astype(np.float32)
-    if not steps:
-        return lower, upper
-    for bound in (lower, upper):
-        bound /= steps
+    lower, upper = rows.lower, rows.upper
+    if low is None or not config.bound_steps:
+        return _filtered(lower, kept, config), _filtered(upper, kept, config)
+    if config.fits:
+        cuts = (_filtered(bound, kept, config) for bound in (rows.lower_low, lower, rows.upper_low, upper))
+        return np.where(low, next(cuts), next(cuts)), np.where(low, next(cuts), next(cuts))
+    lower, upper = np.where(low, rows.lower_low, lower), np.where(low, rows.upper_low, upper)
+    return _filtered(lower, kept, config), _filtered(upper, kept, config)
+
+
+def _filtered(bound: np.ndarray, kept: np.ndarray, config: Config) -> np.ndarray:
+    """Convert bounds to pixels, and take their medians."""
+    bound = bound.astype(np.float32)
+    if config.bound_steps:
+        bound /= config.bound_steps
         bound += np.float32(config.disparity.minimum)
-    return lower, upper
+    return np.asarray(median(bound, kept, config.median.size)) if config.median else bound
 
 
 def regularized(

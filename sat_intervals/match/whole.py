@@ -6,10 +6,11 @@ from sat_intervals.config import Config
 from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.normalization import PairStatistics
-from sat_intervals.match.patch import Frame, match_patch, patch_windows
+from sat_intervals.match.patch import Frame, Patch, match_patch, patch_windows
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_rows
+from sat_intervals.match.refinement import pixel_windows
 from sat_intervals.products import NO_DATA, NO_DISPARITY, Bands
-from sat_intervals.tiling import View, Window
+from sat_intervals.tiling import View, Views, Window
 
 
 def match_whole(
@@ -32,7 +33,17 @@ def match_whole(
     if config.ambiguity:
         histogram = ambiguity_histogram(raw.ambiguity, raw.winner != NO_DISPARITY, config.largest_ambiguity)
         scale = confidence_scale(config.ambiguity, histogram)
-    return postprocess_rows(RawRows.of(raw, patch.right), 0, frame.whole.height, scale, config)
+    rows = raw_rows(patch, (whole_view(left), whole_view(right)), frame.whole, config)
+    return postprocess_rows(rows, 0, frame.whole.height, scale, config)
+
+
+def raw_rows(patch: Patch, views: Views, window: Window, config: Config) -> RawRows:
+    """Return the rows of a pair that was matched as one tile, with the pixels that the settings need."""
+    rows = RawRows.of(patch.raw, patch.right)
+    if config.fits:
+        left, right = map(cut, views, pixel_windows(window, config))
+        rows = rows.with_pixels((left, right))
+    return rows
 
 
 def whole_view(image: np.ma.MaskedArray) -> View:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 from rasterio.io import DatasetWriter
 
-from sat_intervals.products import BANDS, FLAGS, INVALID, POINTS, RANGES, SURFACE, TRUTH, Band
+from sat_intervals.products import BANDS, FLAGS, INVALID, POINTS, RANGES, SIGMA, SURFACE, TRUTH, Band
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,10 @@ VALIDITY = File("validity.tif", "uint16", None, (_VALIDITY,), _FLAG_TAGS)
 RUN_FILES = (INTERVALS, VALIDITY)
 
 
-def run_files(compression: str) -> tuple[File, File]:
-    """Return the files of a run with a compression of the settings."""
-    return replace(INTERVALS, compression=compression), replace(VALIDITY, compression=compression)
+def run_files(compression: str, *, sigma: bool = False) -> tuple[File, File]:
+    """Return the files of a run with the compression of the settings, and with the band of deviations."""
+    intervals = replace(INTERVALS, compression=compression, bands=(*BANDS, SIGMA) if sigma else BANDS)
+    return intervals, replace(VALIDITY, compression=compression)
 
 
 def points_file(name: str) -> File:

@@ -15,12 +15,12 @@ import numpy as np
 from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError
 from sat_intervals.match.postprocess import ConfidenceScale, confidence_scale
 from sat_intervals.progress import Progress, logged_stage
-from sat_intervals.raster import OutputError, OutputWriter, Part, run_files
+from sat_intervals.raster import OutputError, OutputWriter, Part
 from sat_intervals.raster.publishing import new_file
 from sat_intervals.run.inputs import check_unchanged
 from sat_intervals.run.job import Job, remove_tiles
 from sat_intervals.run.report import report_of, tags_of
-from sat_intervals.run.state import RUN_REPORT
+from sat_intervals.run.state import RUN_REPORT, files_of_run
 from sat_intervals.run.strips import (
     PartKey,
     check_codecs,
@@ -45,7 +45,7 @@ def assemble(job: Job, workers: Workers, seconds: dict[str, float], progress: Pr
     scale = scale_of(job, tables)
     with logged_stage(seconds, "bands"):
         parts = finish_strips(job, workers, scale, progress)
-    files, place = run_files(job.config.products.compression), job.left.georeferencing.shifted(region)
+    files, place = files_of_run(job.config), job.left.georeferencing.shifted(region)
     with (
         _resumable(job),
         OutputWriter(job.out, files, region.height, region.width, place, tags_of(job.config)) as writer,
@@ -102,7 +102,7 @@ def _copy_parts(
     job: Job, writer: OutputWriter, metas: Mapping[PartKey, Mapping[str, Any]], workers: Workers, progress: Progress
 ) -> None:
     """Copy the finished parts of a run into its files, on workers that share its folder, else in this process."""
-    files, of = run_files(job.config.products.compression), parts_of(job)
+    files, of = files_of_run(job.config), parts_of(job)
     copied, total, retries = list[str | None](), len(files) * len(metas), job.config.cluster.retries
     with nullcontext(workers) if job.is_home else closing(Threads(_THREADS)) as copiers:
 

@@ -12,7 +12,7 @@ from sat_intervals.config import Calibration, key_of
 from sat_intervals.config.calibration import COVERAGES, Levels
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.match.calibration import choose, left_out, means, not_below, pooled
-from sat_intervals.match.measurement import Measured, ladder
+from sat_intervals.match.measurement import Measured, ladders
 from sat_intervals.match.memory import STRIP_PIXELS
 from sat_intervals.run.checks import checked_region
 from sat_intervals.run.measure import Subject, check_enough
@@ -75,12 +75,12 @@ def calibration_from(
 ) -> tuple[Calibration, list[dict[str, float]]]:
     """Return the calibration of measured subjects, and what to expect of it: a row for each coverage."""
     config = subjects[0].config
-    rungs, pool, expected, notes = ladder(config), pooled(parts), [], []
+    rungs, pool, expected, notes = ladders(config), pooled(parts), [], []
     chosen: list[Levels] = []
     for coverage, groups in zip(COVERAGES, left_out(parts, rungs, COVERAGES), strict=True):
         levels, doubts = choose(pool, rungs, coverage)
         levels = not_below(levels, chosen[-1] if chosen else None)
-        chosen.append(levels.model_copy(update={"high": round(levels.high, 2), "low": round(levels.low, 2)}))
+        chosen.append(levels.model_copy(update={"high": round(levels.high, 3), "low": round(levels.low, 2)}))
         notes += [f"coverage {coverage:g}: {doubt}" for doubt in doubts]
         expected.append({"coverage": coverage, **means(groups.values())})
     provenance = {

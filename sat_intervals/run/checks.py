@@ -55,7 +55,7 @@ def check_tiles(config: Config, region: Window) -> None:
     rows = min(BLOCK, region.height)
     memory = _job_bytes(config)
     if memory is not None:
-        check_strips(rows, region.width, memory, config.cluster.cores)
+        check_strips(rows, region.width, config, memory, config.cluster.cores)
     if config.cluster.kind not in ("threads", "processes"):
         return
     height, width = (min(config.tiles.size, side) for side in (region.height, region.width))
@@ -67,7 +67,7 @@ def check_tiles(config: Config, region: Window) -> None:
         "choose a smaller --tile-size or fewer --workers",
     )
     check_memory(
-        strips * strip_bytes(rows, region.width),
+        strips * strip_bytes(rows, region.width, config),
         f"strips of {rows} x {region.width} pixels, {strips} at once,",
         "choose fewer --workers or a narrower --window",
     )

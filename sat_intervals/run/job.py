@@ -23,13 +23,12 @@ from sat_intervals.raster import (
     file_bytes,
     files_of,
     part_bytes,
-    run_files,
 )
 from sat_intervals.raster.identity import check_not_replaced
 from sat_intervals.run.checks import check_tiles, checked_pair, checked_region, fitted_to_jobs
 from sat_intervals.run.inputs import describe_inputs, identities
 from sat_intervals.run.local_ranges import searched
-from sat_intervals.run.state import OUTPUTS, check_folder, next_step, read_report
+from sat_intervals.run.state import OUTPUTS, check_folder, files_of_run, next_step, read_report
 from sat_intervals.run.workers import is_remote
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import MANIFEST, PLACE, StoreError, digest, place_of, read_manifest, write_manifest
@@ -132,7 +131,7 @@ class Job:
 
     def _check_space(self) -> None:
         """Raise if disks have no room for what a run has yet to write."""
-        region, files = self.store.grid.region, run_files(self.config.products.compression)
+        region, files = self.store.grid.region, files_of_run(self.config)
         share = len(self.waiting()) / len(self.store.grid)
         tiles = store_bytes(self.store.grid, has_coverage=self.config.has_coverage)
         handed = handed_bytes(

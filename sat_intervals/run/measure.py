@@ -7,18 +7,19 @@ from dataclasses import dataclass, replace
 from decimal import Decimal
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sat_intervals.config import Calibration, Config, Interval, key_of
 from sat_intervals.config.calibration import COVERAGES
+from sat_intervals.config.sections import Refinement
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.match.histogram import bias_histogram
-from sat_intervals.match.measurement import FIELDS, HIGH, QUANTILES, SCHEMES, Measured, ladder, measure
-from sat_intervals.match.memory import STRIP_PIXELS
+from sat_intervals.match.measurement import FIELDS, HIGH, QUANTILES, SCHEMES, Ladders, Measured, ladders, measure
 from sat_intervals.match.postprocess import (
     ConfidenceScale,
+    Filtered,
     RawRows,
     filter_rows,
     halo,
@@ -26,16 +27,18 @@ from sat_intervals.match.postprocess import (
     widened,
     with_halo,
 )
+from sat_intervals.match.refinement import both
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.products import INVALID
 from sat_intervals.progress import Progress
-from sat_intervals.raster import Image, Layer, open_image
+from sat_intervals.raster import BLOCK, Image, Layer, open_image
 from sat_intervals.run.assemble import scale_of
 from sat_intervals.run.connection import Connection
 from sat_intervals.run.inputs import check_unchanged
 from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.pair import check_failures, match_jobs, measure_images
 from sat_intervals.run.search_range import Finder
+from sat_intervals.run.strips import raw_rows
 from sat_intervals.run.workers import Workers
 from sat_intervals.store.lock import locked
 from sat_intervals.tiling import Window
@@ -43,6 +46,8 @@ from sat_intervals.tiling import Window
 FEWEST = 1000  # pixels with truth, of all pairs
 # A single pair is judged in blocks, this many along each side.
 _BLOCKS = 4
+# In place of a rung of levels: the cut that factors are of.
+_OF_FITS = -1
 
 
 @dataclass(frozen=True)
@@ -89,13 +94,13 @@ def measure_subjects(
 ) -> tuple[list[Measured], dict[str, Any]]:
     """Match subjects at every level of the ladder, in ``folder``; return measurements, and the `key_of` settings."""
     found: list[Measured] = []
-    key, levels = key_of(subjects[0].config), ladder(subjects[0].config)
+    key, rungs = key_of(subjects[0].config), ladders(subjects[0].config)
     compile_kernels(_at_levels(subjects[0].config, 0.0, 0.0, QUANTILES[-1]))
     with _scratch(folder) as scratch, Connection(subjects[0].config.cluster, scratch) as workers:
         for number, subject in enumerate(subjects):
             one = progress if len(subjects) == 1 else partial(_of_all, progress, "subjects", number, len(subjects))
             one("subjects", 0, 1)
-            found += _of_subject(workers, subject, levels, scratch / str(number), len(subjects) == 1, one)
+            found += _of_subject(workers, subject, rungs, scratch / str(number), len(subjects) == 1, one)
     progress("subjects", len(subjects), len(subjects))
     check_enough(sum(part.kept for part in found), subjects, "kept pixels have a truth")
     return found, key
@@ -120,13 +125,13 @@ def _of_all(progress: Progress, stage: str, number: int, total: int, *_: object)
 
 
 def _of_subject(
-    workers: Workers, subject: Subject, levels: np.ndarray, folder: Path, in_blocks: bool, progress: Progress
+    workers: Workers, subject: Subject, rungs: Ladders, folder: Path, in_blocks: bool, progress: Progress
 ) -> list[Measured]:
     """Match a subject, with two levels of the ladder at a time, and measure it."""
     gauge: _Gauge | None = None
     with ExitStack() as stack:
-        find, firsts = Finder(workers, progress), range(0, levels.size, 2)
-        jobs = [_begun(find, subject, levels[first : first + 2], folder / str(first), stack) for first in firsts]
+        find, pairs = Finder(workers, progress), _pairs(rungs)
+        jobs = [_begun(find, subject, rungs, pair, folder / str(pair[1]), stack) for pair in pairs]
         # several tiles of one job keep all workers busy; stores of all jobs at once would fill the disk
         batches = [jobs] if len(jobs[0].store.grid) == 1 else [[job] for job in jobs]
         for number, batch in enumerate(batches):
@@ -138,17 +143,27 @@ def _of_subject(
             for matched in match_jobs(workers, batch, step):
                 job = matched.job
                 check_failures(job, matched.failures)
-                gauge = gauge or _Gauge(job, subject, levels.size, in_blocks)
-                gauge.add(job, 2 * jobs.index(job))
+                gauge = gauge or _Gauge(job, subject, rungs, in_blocks)
+                gauge.add(job, pairs[jobs.index(job)])
                 job.store.remove()
         check_unchanged(jobs[0].inputs, subject.left, subject.right, jobs[0].config)
     assert gauge is not None  # there are jobs
     return gauge.measured()
 
 
-def _begun(find: Finder, subject: Subject, levels: np.ndarray, out: Path, stack: ExitStack) -> Job:
-    """Prepare the job that matches a subject at two levels; open its store."""
-    config = _at_levels(subject.config, float(levels[0]), float(levels[1]), None)
+def _pairs(rungs: Ladders) -> list[tuple[int, int]]:
+    """Return the rungs of levels that each job matches; _OF_FITS is the cut that factors are of."""
+    numbers = [*([] if rungs.are_one else [_OF_FITS]), *range(rungs.low.size)]
+    return list(zip(numbers[::2], [*numbers[1::2], *numbers[-1:]], strict=False))
+
+
+def _begun(find: Finder, subject: Subject, rungs: Ladders, pair: tuple[int, int], out: Path, stack: ExitStack) -> Job:
+    """Prepare the job that matches a subject at two rungs; open its store."""
+    high, low = (subject.config.fit_cut if rung == _OF_FITS else float(rungs.low[rung]) for rung in pair)
+    config = subject.config
+    if config.fits:  # its tiles are those of V-fit, at any levels
+        config = config.model_copy(update={"refinement": Refinement(method="vfit")})
+    config = _at_levels(config, high, low, None)
     job = prepare(subject.left, subject.right, out, config, window=subject.window, pair=out.parent.name, find=find)
     job = replace(job, has_files=False)
     job.begin()
@@ -165,15 +180,39 @@ def _at_levels(config: Config, high: float, low: float, quantile: float | None) 
     return config.model_copy(update={"interval": interval, "disparity": disparity})
 
 
+class _Piece(NamedTuple):
+    """Rows with their halo, the range of those that are measured, and their truths and parts."""
+
+    rows: Filtered
+    first: int
+    last: int
+    truth: np.ndarray
+    parts: np.ndarray
+
+    @property
+    def inner(self) -> slice:
+        """Return the rows that are measured."""
+        return slice(self.first, self.last)
+
+    def of(self, name: str) -> np.ndarray:
+        """Return a band of the rows that are measured."""
+        return np.asarray(getattr(self.rows, name)[self.inner])
+
+    @property
+    def kept(self) -> np.ndarray:
+        """Return the mask of valid pixels."""
+        return np.asarray(self.of("validity") & INVALID == 0)
+
+
 class _Gauge:
     """Measures the intervals of a subject, job by job."""
 
-    def __init__(self, job: Job, subject: Subject, rungs: int, in_blocks: bool) -> None:
-        self._subject, self._in_blocks = subject, in_blocks
+    def __init__(self, job: Job, subject: Subject, rungs: Ladders, in_blocks: bool) -> None:
+        self._subject, self._in_blocks, self._rungs = subject, in_blocks, rungs
         region = job.store.grid.region
         self._shape = region.height, region.width
         parts = _BLOCKS**2 if in_blocks else 1
-        self._tables = np.zeros((parts, rungs, SCHEMES, FIELDS))
+        self._tables = np.zeros((parts, rungs.low.size, SCHEMES, FIELDS))
         self._known, self._good = np.zeros((2, parts))
         self._bias = self._found_bias(job) if subject.remove_bias else 0.0
 
@@ -189,8 +228,9 @@ class _Gauge:
 
     def _found_bias(self, job: Job) -> float:
         histogram = bias_histogram()
-        for row, strip, first, last, scale in _strips(job):
-            rows, truth = filter_rows(strip, scale, job.config), self._truth(row, last - first)
+        config = self._config(job)
+        for row, strip, first, last, scale in _strips(job, config):
+            rows, truth = filter_rows(strip, scale, config), self._truth(row, last - first)
             chosen = (rows.validity[first:last] & INVALID == 0) & np.isfinite(truth)
             histogram.add(rows.disparity[first:last][chosen].astype(np.float64) - truth[chosen])
         return histogram.median() or 0.0
@@ -205,42 +245,63 @@ class _Gauge:
         rows, columns = (np.arange(side) * _BLOCKS // side for side in self._shape)
         return _BLOCKS * rows[row : row + height, None] + columns
 
-    def add(self, job: Job, rung: int) -> None:
-        """Measure a job, whose levels are the rungs ``rung`` and ``rung + 1``."""
-        config = job.config
-        for row, strip, first, last, scale in _strips(job):
-            inner = slice(first, last)
+    def add(self, job: Job, pair: tuple[int, int]) -> None:
+        """Measure a job, whose cuts are a pair of rungs, see `_pairs`."""
+        config = self._config(job)
+        for row, strip, first, last, scale in _strips(job, config):
             truth, parts = self._truth(row, last - first) + self._bias, self._parts(row, last - first)
-            for cut in (0, 1):
-                lower, upper = (strip.lower_low, strip.upper_low) if cut else (strip.lower, strip.upper)
+            for rung, names in zip(dict.fromkeys(pair), (("lower", "upper"), ("lower_low", "upper_low")), strict=False):
+                lower, upper = (getattr(strip, name) for name in names)
                 rows = filter_rows(
                     strip._replace(lower=lower, upper=upper, lower_low=lower, upper_low=upper), scale, config
                 )
-                assert rows.low is not None  # checked
-                disparity, kept = rows.disparity[inner], rows.validity[inner] & INVALID == 0
-                if rung + cut == 0:
-                    known = np.isfinite(truth)
-                    for counts, chosen in ((self._known, known), (self._good, kept & (abs(disparity - truth) <= 1))):
-                        counts += np.bincount(parts[chosen], minlength=counts.size)
-                kept &= np.isfinite(truth)
-                low, high = kept & rows.low[inner], kept & ~rows.low[inner]
-                for scheme, quantile in enumerate((None, *QUANTILES)):
-                    chosen = np.flatnonzero(high if scheme == HIGH else low)
-                    bounds = regularized(rows, first, last, config, quantile)
-                    middle, lower, upper, true, part = (
-                        band.ravel()[chosen] for band in (disparity, *bounds, truth, parts)
-                    )
-                    lower, upper = widened(lower, upper, middle, config)
-                    tolerance, number = self._subject.tolerance, len(self._tables)
-                    self._tables[:, rung + cut, scheme] += measure(lower, upper, true, tolerance, part, number)
+                piece = _Piece(rows, first, last, truth, parts)
+                if rung == (0 if self._rungs.are_one else _OF_FITS):
+                    self._count(piece)
+                for number, scheme, bounds in self._bounds(piece, rung, config):
+                    self._tables[:, number, scheme] += self._measured(piece, scheme, bounds, config)
+
+    def _config(self, job: Job) -> Config:
+        return job.config.model_copy(update={"refinement": self._subject.config.refinement})
+
+    def _bounds(
+        self, piece: _Piece, rung: int, config: Config
+    ) -> Iterator[tuple[int, int, tuple[np.ndarray, np.ndarray]]]:
+        """Yield the rungs and schemes that a piece is measured for, and their bounds."""
+        if rung == _OF_FITS:
+            fits, lower, upper = piece.rows.fits(piece.inner), piece.of("lower"), piece.of("upper")
+            for number, factor in enumerate(self._rungs.high):
+                yield number, HIGH, both(fits, lower, upper, factor, config)
+            return
+        for scheme, quantile in enumerate((None, *QUANTILES)):
+            if scheme != HIGH or self._rungs.are_one:
+                yield rung, scheme, regularized(piece.rows, piece.first, piece.last, config, quantile)
+
+    def _count(self, piece: _Piece) -> None:
+        """Count pixels with truth, and good ones."""
+        near = piece.kept & (abs(piece.of("disparity") - piece.truth) <= 1)
+        for counts, chosen in ((self._known, np.isfinite(piece.truth)), (self._good, near)):
+            counts += np.bincount(piece.parts[chosen], minlength=counts.size)
+
+    def _measured(
+        self, piece: _Piece, scheme: int, bounds: tuple[np.ndarray, np.ndarray], config: Config
+    ) -> np.ndarray:
+        """Measure the bounds of the kept pixels of a scheme's class."""
+        chosen = np.flatnonzero(piece.kept & np.isfinite(piece.truth) & (piece.of("low") == (scheme != HIGH)))
+        middle, lower, upper, true, part = (
+            band.ravel()[chosen] for band in (piece.of("disparity"), *bounds, piece.truth, piece.parts)
+        )
+        lower, upper = widened(lower, upper, middle, config)
+        return measure(lower, upper, true, self._subject.tolerance, part, len(self._tables))
 
 
-def _strips(job: Job) -> Iterator[tuple[int, RawRows, int, int, ConfidenceScale]]:
+def _strips(job: Job, config: Config) -> Iterator[tuple[int, RawRows, int, int, ConfidenceScale]]:
     """Yield first row of the region, raw rows with their halo, ``first`` and ``last`` of `with_halo`, and the scale."""
-    region, count = job.store.grid.region, job.config.disparity.count
+    height = job.store.grid.region.height
     scale = scale_of(job, job.store.tables())
     row = 0
-    raw = (RawRows(**strip) for strip in job.store.strips(max(1, STRIP_PIXELS // region.width), count))
-    for rows, first, last in with_halo(raw, halo(job.config)):
+    starts = range(0, height, BLOCK)
+    raw = (rows for start in starts for rows in raw_rows(job, config, start, min(height, start + BLOCK)))
+    for rows, first, last in with_halo(raw, halo(config)):
         yield row, rows, first, last, scale
         row += last - first

@@ -18,12 +18,13 @@ from sat_intervals.match.patch import Frame, path_window
 from sat_intervals.match.schedule import blocks_of, handed_bytes, time_of
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
-from sat_intervals.raster import BLOCK, Image, file_bytes, part_bytes, run_files
+from sat_intervals.raster import BLOCK, Image, file_bytes, part_bytes
 from sat_intervals.run import assemble
 from sat_intervals.run.checks import check_tiles, checked_pair, checked_region, fitted_to_jobs
 from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.pair import match_pair
 from sat_intervals.run.search_range import find_here
+from sat_intervals.run.state import files_of_run
 from sat_intervals.run.workers import cores_of_process, is_remote, readers, reason, tiles_at_once
 from sat_intervals.store.tiles import store_bytes
 from sat_intervals.tiling import Grid, Window
@@ -72,17 +73,17 @@ def plan(
     region = checked_region(left, window)
     strip = min(BLOCK, region.height), region.width
     if memory is not None:
-        check_strips(*strip, memory)
+        check_strips(*strip, config, memory)
     check_tiles(config, region)
     grid = Grid(region, config.tiles.size)
     # Compiled once a machine: a part of the first plan, not of the run.
     progress("kernels", 0, 1)
     compile_kernels(config)
     seconds, extra = _expected(left, right, config, workers, grid)
-    files = run_files(config.products.compression)
+    files = files_of_run(config)
     together = workers if config.cluster.kind == "threads" else cores_of_process(config.cluster)
     waiting = readers(config.cluster) * waiting_bytes(config)
-    task = max(tile_bytes(config), strip_bytes(*strip))
+    task = max(tile_bytes(config), strip_bytes(*strip, config))
     return Plan(
         search_range=(int(config.disparity.minimum), int(config.disparity.maximum)),
         tile_size=config.tiles.size,

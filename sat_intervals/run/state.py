@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
+from sat_intervals.config import Config
 from sat_intervals.errors import ChangedInputError, SatIntervalsError
-from sat_intervals.raster import RUN_FILES
+from sat_intervals.raster import RUN_FILES, File, run_files
 from sat_intervals.store.manifest import MANIFEST, StoreError, differences, read_manifest
 from sat_intervals.store.tiles import home_of
 
@@ -17,6 +18,11 @@ OUTPUTS = (*(file.name for file in RUN_FILES), RUN_REPORT)
 _SECTIONS = {"settings", "inputs", "tiles"}
 
 NextStep = Literal["start", "resume", "start anew", "complete"]
+
+
+def files_of_run(config: Config) -> tuple[File, File]:
+    """Return the files that a run writes."""
+    return run_files(config.products.compression, sigma=config.products.sigma)
 
 
 def read_report(out: Path) -> dict[str, Any] | None:

@@ -10,13 +10,15 @@ import numpy as np
 
 from sat_intervals.config import Config
 from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.match import postprocess
+from sat_intervals.match import postprocess, refinement
 from sat_intervals.match.memory import STRIP_PIXELS
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, halo, postprocess_strip
+from sat_intervals.match.refinement import pixel_windows, pixels_of
 from sat_intervals.match.statistics import Tally
 from sat_intervals.progress import Progress
-from sat_intervals.raster import BLOCK, RUN_FILES, codec_versions, compressed, factors, run_files
+from sat_intervals.raster import BLOCK, RUN_FILES, codec_versions, compressed, factors, read_views
 from sat_intervals.run.job import Job
+from sat_intervals.run.state import files_of_run
 from sat_intervals.run.workers import Task, Workers, check_not_full, computing, picklable_errors, reason, results
 from sat_intervals.store.arrays import DamagedFileError
 from sat_intervals.store.manifest import digest
@@ -27,7 +29,7 @@ PartKey = tuple[int, int]
 """Level of a file, 0 for its pixels, and row of blocks from the top."""
 
 # What finishes rows decides their bytes, too. The number increases when parts change.
-_CODE = zlib.crc32(Path(postprocess.__file__).read_bytes()), 2
+_CODE = *(zlib.crc32(Path(str(module.__file__)).read_bytes()) for module in (postprocess, refinement)), 2
 _HALF = "half of {}"
 
 
@@ -124,20 +126,34 @@ def finish_strip(job: Job, of: str, key: PartKey, scale: ConfidenceScale) -> str
         region, search, margin = job.store.grid.region, job.config.disparity, halo(job.config)
         first, last = key[1] * BLOCK, min(region.height, (key[1] + 1) * BLOCK)
         top, bottom = max(0, first - margin), min(region.height, last + margin)
-        shape = last - first, region.width
-        intervals, validity = np.empty((4, *shape), np.float32), np.empty((1, *shape), np.uint16)
+        shape, with_sigma = (last - first, region.width), job.config.products.sigma
+        intervals, validity = np.empty((4 + with_sigma, *shape), np.float32), np.empty((1, *shape), np.uint16)
         tally, row = Tally(search.count, search.minimum), 0
-        raw = job.store.strips(max(1, STRIP_PIXELS // shape[1]), search.count, top, bottom)
         try:
-            pieces = (RawRows(**piece) for piece in raw)
+            pieces = raw_rows(job, job.config, top, bottom)
             for final in postprocess_strip(pieces, first - top, shape[0], scale, job.config):
                 rows = slice(row, row := row + len(final.validity))
-                intervals[:, rows], validity[:, rows] = final[:4], final.validity
+                intervals[:4, rows], validity[:, rows] = final[:4], final.validity
+                if with_sigma:
+                    intervals[4, rows] = final.sigma
                 tally.add(final)
         except DamagedTilesError as error:
             return str(error)
         _write(job, of, key, [intervals, validity], counts=tally.counts())
     return None
+
+
+def raw_rows(job: Job, config: Config, first: int, last: int) -> Iterator[RawRows]:
+    """Yield raw products of the rows ``[first, last)`` of the region, with the pixels that the settings need."""
+    region, search = job.store.grid.region, config.disparity
+    if config.fits:
+        window = Window(region.row + first, region.column, last - first, region.width)
+        left, right = pixels_of(read_views((job.left, job.right), pixel_windows(window, config)))
+    row = 0
+    for piece in job.store.strips(max(1, STRIP_PIXELS // region.width), search.count, first, last):
+        rows = RawRows(**piece)
+        here = slice(row, row := row + len(rows.winner))
+        yield rows._replace(left=left[here], right=right[here]) if config.fits else rows
 
 
 def reduce_rows(job: Job, of: str, key: PartKey, below: Sequence[PartKey]) -> str | None:
@@ -161,7 +177,7 @@ def _write(job: Job, of: str, key: PartKey, rasters: list[np.ndarray], **meta: A
     is_top = key[0] + 1 == len(rows_of_levels(job.store.grid.region))
 
     def arrays() -> Iterator[tuple[str, np.ndarray]]:
-        for file in run_files(job.config.products.compression):
+        for file in files_of_run(job.config):
             raster = rasters.pop(0)
             made = compressed(raster, file)
             blocks[file.kind] = made.sizes

@@ -15,7 +15,7 @@ from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import InputError, RunError, SatIntervalsError
 from sat_intervals.match.calibration import left_out, means
 from sat_intervals.match.mccnn import load_network
-from sat_intervals.match.measurement import ladder
+from sat_intervals.match.measurement import ladders
 from sat_intervals.progress import Progress
 from sat_intervals.raster import OutputError
 from sat_intervals.run.calibrate import calibration_from
@@ -62,7 +62,7 @@ def tuned(
         subjects,
         float(np.mean([part.kept / part.known for part in parts if part.known])),
         float(np.mean([part.good / part.known for part in parts if part.known])),
-        means(left_out(parts, ladder(subjects[0].config), [COVERAGE])[0].values()),
+        means(left_out(parts, ladders(subjects[0].config), [COVERAGE])[0].values()),
         calibration,
     )
 

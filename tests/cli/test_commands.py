@@ -190,7 +190,7 @@ def test_match__refuses_options_that_do_not_suit_the_pair(folder, tmp_path, opti
         ("sgn: {p1: 8}", "unknown key 'sgn', did you mean sgm? (known: preset, disparity, rows, cost, sgm, "),
         ("sgm: {p3: 8}", "unknown key 'sgm.p3' (known: penalty, p1, p2, span)"),
         ("sgm: {p1: eight}", "sgm.p1 is 'eight', allowed: number > 0"),
-        ("sgm: {p1: 140}", "sgm: p1 140 is above p2 128"),
+        ("sgm: {p1: 150}", "sgm: p1 150 is above p2 144"),
         ("interval: {alpha: 1.5}", "interval.alpha is 1.5, allowed: number > 0, <= 1"),
         ("cost: null", "cost is null, allowed: section of method, window"),
         ("median: {size: 4}", "median.size is 4, allowed: integer >= 3"),

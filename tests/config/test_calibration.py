@@ -106,7 +106,7 @@ def test_load_calibration__names_a_missing_file() -> None:
     ("settings", "difference"),
     [
         ({"cost": {"window": 5}}, "cost.window is 7 in the calibration and 5 in the settings"),
-        ({"sgm": {"p2": 64}}, "sgm.p2 is 128 in the calibration and 64 in the settings"),
+        ({"sgm": {"p2": 64}}, "sgm.p2 is 144 in the calibration and 64 in the settings"),
         ({"median": None}, "median.size is 3 in the calibration and null in the settings"),
     ],
 )

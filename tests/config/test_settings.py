@@ -109,9 +109,9 @@ def test_preset_text__paper_has_its_window_penalties_and_alpha() -> None:
 
 def test_preset_text__satellite_mccnn_has_constant_penalties_with_their_span() -> None:
     config = load_config(yaml.safe_load(preset_text("satellite-mccnn")), RANGE)
-    sgm = {"penalty": "constant", "p1": 0.6, "p2": 3.5, "span": 42}
+    sgm = {"penalty": "constant", "p1": 0.8, "p2": 4.5, "span": 48}
     assert config == settings(preset="satellite-mccnn", cost={"method": "mccnn"}, sgm=sgm)
-    assert config.cost_span == 42 * COSINE_STEPS
+    assert config.cost_span == 48 * COSINE_STEPS
 
 
 # --- presets beside settings
@@ -144,12 +144,12 @@ def test_load_config__other_penalties_beside_a_preset_need_their_own_span() -> N
     given = RANGE | {"preset": "satellite-mccnn", "sgm": {"p2": 7}}
     assert message(given).startswith("sgm.span is missing: it has no default with cost.method mccnn")
     config = settings(preset="satellite-mccnn", sgm={"p2": 7, "span": 60})
-    assert (config.sgm.p1, config.sgm.span) == (Decimal("0.6"), 60)
+    assert (config.sgm.p1, config.sgm.span) == (Decimal("0.8"), 60)
     assert message(RANGE | {"preset": "mccnn", "sgm": {"p1": 0.6}}).startswith("sgm: span is missing: its default, 16")
 
 
 def test_load_config__another_kind_of_penalties_beside_a_preset_takes_none_of_its_own() -> None:
-    constant = {"penalty": "constant", "p1": 0.6, "p2": 3.5, "span": 42}
+    constant = {"penalty": "constant", "p1": 0.8, "p2": 4.5, "span": 48}
     assert settings(preset="mccnn", sgm=constant).sgm == settings(preset="satellite-mccnn").sgm
     edges = settings(preset="satellite-mccnn", sgm={"penalty": "mc_cnn_fast"}).sgm
     assert edges == settings(preset="mccnn").sgm
@@ -270,7 +270,7 @@ REFUSED = [
     ("cost", {"window": 4}, "cost.window is 4, allowed: integer >= 3, <= 11, odd"),
     ("cost", {"windows": 5}, "unknown key 'cost.windows', did you mean window? (known: method, window)"),
     ("sgm", {"p1": 0}, "sgm.p1 is 0, allowed: number > 0"),
-    ("sgm", {"p1": 129}, "sgm: p1 129 is above p2 128, the penalty of a larger step"),
+    ("sgm", {"p1": 145}, "sgm: p1 145 is above p2 144, the penalty of a larger step"),
     ("sgm", {"p2": 8144}, "sgm.p2 is 8144, allowed: <= 8143 with cost.window 7, so that costs summed over"),
     ("sgm", [8, 32], "sgm is [8, 32], allowed: section of penalty, p1, p2, span or null"),
     ("ambiguity", {"eta_max": 0}, "ambiguity.eta_max is 0, allowed: number > 0, <= 1"),
@@ -389,7 +389,7 @@ def test_load_config__unreadable_yaml_names_file_and_line(write, text: str | byt
 
 
 def test_load_config__merged_keys_may_be_given_again(write) -> None:
-    file = write("cross_check: &check {method: fast}\nrefinement: {<<: *check, method: vfit}\n")
+    file = write("cross_check: &check {method: fast}\nrefinement: {<<: *check, method: least_squares}\n")
     assert load_config(file, RANGE) == settings()
 
 
@@ -421,7 +421,7 @@ def test_cost_span__is_the_theoretical_one(window: int, sgm: tuple[int, int] | N
 
 def test_ambiguity_levels__are_70_exact_multiples() -> None:
     config = settings()
-    assert config.ambiguity_levels == tuple(i * 1408 // 100 for i in range(70))
+    assert config.ambiguity_levels == tuple(i * 1536 // 100 for i in range(70))
 
 
 @given(st.integers(1, 1000), st.sampled_from([3, 5, 7, 9, 11]), st.integers(1, 600))
@@ -434,7 +434,7 @@ def test_cut_level__is_the_floor_of_the_written_decimal(thousandths: int, window
 def test_ambiguity_levels__stay_below_eta_max(maximum: int, step: int) -> None:
     maximum, step = max(maximum, step), min(maximum, step)
     config = settings(ambiguity={"eta_max": maximum / 100, "eta_step": step / 100})
-    assert config.ambiguity_levels == tuple(hundredths * 1408 // 100 for hundredths in range(0, maximum, step))
+    assert config.ambiguity_levels == tuple(hundredths * 1536 // 100 for hundredths in range(0, maximum, step))
 
 
 @given(

@@ -116,7 +116,7 @@ def test_cars_method__has_the_penalties_of_cars_and_confidence_relative_to_its_r
     assert (config.ambiguity.normalization, config.interval.coverage) == ("range", None)
     given = {"preset": "satellite", "interval": {"coverage": 0.9}}
     config = SatIntervals({"settings": given})._config(-9, 4)
-    assert (config.sgm.p2, config.ambiguity.normalization, float(config.interval.coverage)) == (128, "percentile", 0.9)
+    assert (config.sgm.p2, config.ambiguity.normalization, float(config.interval.coverage)) == (144, "percentile", 0.9)
     for wrong in ({"disparity": {"minimum": 0}}, {"interval": None}):
         with pytest.raises(SatIntervalsError, match="leave out disparity, and null for interval or ambiguity"):
             SatIntervals({"settings": wrong})

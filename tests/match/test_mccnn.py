@@ -417,7 +417,7 @@ def test_match_arrays__is_as_accurate_as_asked_on_development_scenes(shared_data
                 warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
                 left, right, truth = (rasterio.open(folder / f"{layer}.tif") for layer in ("left", "right", "truth"))
             with left, right, truth:
-                config = settings(minimum, maximum, fp32 if name == "fp32" else None)
+                config = settings(minimum, maximum, fp32 if name == "fp32" else "full")
                 result = match_arrays(left.read(1, masked=True), right.read(1, masked=True), config)
                 true = truth.read(1)
             lower, upper = result["lower"].to_numpy(), result["upper"].to_numpy()

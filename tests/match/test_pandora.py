@@ -242,7 +242,7 @@ def test_features__have_the_cosines_of_pandora(pandora, shared_data, tmp_path, k
     folder, images, (minimum, maximum) = cones(shared_data)
     weights = trained_network(shared_data, tmp_path / "mb.onnx") if kind == "fp32" else None
     theirs = -mccnn_peer(pandora, folder, (minimum, maximum), weights)
-    network = load_network(weights_file(weights and str(weights)))
+    network = load_network(weights_file(str(weights or "full")))
     statistics = [statistics_of(_moments(np.ma.asarray(image))) for image in images]
     left, right = (
         network(((image - statistics.mean) / statistics.deviation).astype(np.float32))

@@ -112,7 +112,7 @@ def test_match_batch__takes_a_preset_of_all_pairs_or_of_one(images, tmp_path, pl
     report = match_batch(read_batch(images / "presets.csv"), tmp_path, config, overrides=overrides)
     assert {name: end["state"] for name, end in report.items()} == {"one": "done", "two": "done"}
     settings = [open_run(tmp_path / name).config for name in ("one", "two")]
-    assert [(one.preset, one.sgm.p2) for one in settings] == [("satellite", 128), ("paper", 32)]
+    assert [(one.preset, one.sgm.p2) for one in settings] == [("satellite", 144), ("paper", 32)]
 
 
 def test_batch__goes_on_after_a_failing_pair_and_then_does_only_what_is_missing(images, tmp_path):

@@ -15,12 +15,13 @@ import pytest
 import rasterio
 from helpers import COMMAND, LOCK, OUTPUTS, PLACE, hashes, invoke, wait_until, write_pair
 
+import sat_intervals
 from sat_intervals.config import Cluster, load_config
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.memory import strip_bytes
 from sat_intervals.products import INVALID
-from sat_intervals.raster import BLOCK, OutputError, OutputWriter, write_layer
+from sat_intervals.raster import BLOCK, OutputError, OutputWriter, read_layers, write_layer
 from sat_intervals.results import open_run
 from sat_intervals.run import assemble, pair, strips
 from sat_intervals.run.checks import check_tiles
@@ -198,6 +199,28 @@ def test_finish_strip__refuses_a_worker_with_other_codecs(tall, tmp_path, monkey
     assert not parts(out)
 
 
+def test_finish_strips__of_least_squares_are_equal_for_any_tiling(tmp_path):
+    """Two strips, whose fits need rows of both images above and below; the fifth band has their deviations."""
+    settings = write_pair(tmp_path, make_scene(BLOCK + 90, 130, seed=2), preset="satellite", products={"sigma": True})
+    found = {}
+    for size in (64, 256, 1024):
+        out = tmp_path / str(size)
+        match_pair(tmp_path / "left.tif", tmp_path / "right.tif", out, settings | {"tiles": {"size": size}})
+        found[size] = hashes(out)
+    assert found[64] == found[256] == found[1024]
+    disparity, lower, upper, _, sigma = read_layers(out / "intervals.tif")
+    valid = read_layers(out / "validity.tif")[0] & INVALID == 0
+    assert 0.8 < np.isfinite(sigma[valid]).mean() < 1
+    assert (sigma[np.isfinite(sigma)] >= 0).all()
+    assert np.isnan(sigma[~valid]).all()
+    assert ((lower <= disparity) & (disparity <= upper))[valid].all()
+    run = open_run(out)
+    assert run.read_bands(Window(0, 0, 5, 5)).confidence.shape == (5, 5)
+    np.testing.assert_array_equal(sat_intervals.open(out)["sigma"].values, sigma)
+    with pytest.raises(SatIntervalsError, match=r"products.sigma needs refinement.method least_squares"):
+        load_config({"preset": "paper", "products": {"sigma": True}})
+
+
 # ---- Memory and space -------------------------------------------------------------------------------------------
 def wide_job(folder: Path):
     write_layer(folder / "wide.tif", np.ones((600, 5000), np.uint8), 0, PLACE)
@@ -217,13 +240,13 @@ def test_strip_bytes__bounds_what_writing_a_strip_takes(tmp_path):
     strips._write(job, strips.parts_of(job), (0, 0), rasters)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    most = strip_bytes(BLOCK, 5000)
+    most = strip_bytes(BLOCK, 5000, job.config)
     assert 0.5 * most < bands + peak < most
 
 
 def test_check_tiles__refuses_strips_that_do_not_fit(monkeypatch):
     config, wide = (
-        load_config({"disparity": {"minimum": 0, "maximum": 3}, "tiles": {"size": 64}}),
+        load_config({"preset": "paper", "disparity": {"minimum": 0, "maximum": 3}, "tiles": {"size": 64}}),
         Window(0, 0, 900, 99999),
     )
     monkeypatch.setattr("sat_intervals.match.memory.usable_memory", lambda: 2 * 10**9)

@@ -1,0 +1,94 @@
+"""Refined disparities and their intervals: bounds, pixels that stay, and worked examples."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.ndimage import gaussian_filter
+
+from sat_intervals import load_config, match_arrays
+from sat_intervals.match.refinement import Refined, both, pixel_windows, pixels_of, refined
+from sat_intervals.match.whole import cut, whole_view
+from sat_intervals.products import INVALID, REGULARIZED
+from sat_intervals.tiling import Window
+
+SEARCH = {"minimum": -4, "maximum": 12}
+
+
+def pair(rows=90, columns=120, shift=3.3):
+    """Textured images; the right one is moved by a fraction of a pixel, and noisy."""
+    random = np.random.default_rng(0)
+    ground = gaussian_filter(random.normal(0, 1, (rows, 8 * (columns + 20))), (1, 8)) * 3000 + 500
+    left = ground[:, 0 : 8 * columns : 8]
+    start = -round(8 * shift) % 8
+    whole = int(np.ceil(shift))
+    right = ground[:, start : start + 8 * columns : 8]
+    right = np.concatenate([random.normal(500, 100, (rows, whole)), right[:, : columns - whole]], axis=1)
+    return left, right + random.normal(0, 3, right.shape)
+
+
+@pytest.fixture(scope="module")
+def matched():
+    """Results of a pair by both refinements."""
+    images = pair()
+    return {
+        method: match_arrays(*images, {"preset": "satellite", "disparity": SEARCH, "refinement": {"method": method}} | (
+            {"interval": {"alpha": 0.9}} if method == "vfit" else {}))
+        for method in ("vfit", "least_squares")
+    }  # fmt: skip
+
+
+def test_refined__is_nearer_to_the_truth(matched):
+    inner = np.s_[10:-10, 20:-20]
+    errors = {name: np.abs(found.disparity.values[inner] - 3.3) for name, found in matched.items()}
+    assert np.nanmedian(errors["least_squares"]) < 0.5 * np.nanmedian(errors["vfit"])
+    assert np.nanmedian(errors["least_squares"]) < 0.05
+
+
+def test_bounds__hold_the_disparity_inside_the_search_range(matched):
+    found = matched["least_squares"]
+    valid = found.validity.values & INVALID == 0
+    lower, disparity, upper = (found[name].values[valid] for name in ("lower", "disparity", "upper"))
+    assert ((lower <= disparity) & (disparity <= upper)).all()
+    assert lower.min() >= SEARCH["minimum"]
+    assert upper.max() <= SEARCH["maximum"]
+    assert_array_equal(lower * 64 % 1, 0)
+
+
+def test_match_arrays__gives_the_factor_of_the_calibration(matched):
+    """A larger coverage widens the intervals of high confidence around the same disparities."""
+    images = pair()
+    wide = match_arrays(*images, {"preset": "satellite", "disparity": SEARCH, "interval": {"coverage": 0.95}})
+    usual = matched["least_squares"]
+    high = (usual.validity.values & (INVALID | REGULARIZED)) == 0
+    assert_array_equal(wide.disparity.values[high], usual.disparity.values[high])
+    for one, other in ((usual.upper - wide.upper, 0), (wide.lower - usual.lower, 0)):
+        assert (one.values[high] <= other).all()
+    assert (wide.upper - wide.lower).values[high].mean() > 1.2 * (usual.upper - usual.lower).values[high].mean()
+
+
+def test_both__worked_example():
+    config = load_config({"preset": "satellite", "disparity": {"minimum": 0, "maximum": 20}})
+    fits = Refined(np.float32([5, 5, 5, 19]), np.float32([0.1, np.nan, 0.1, 0.1]))
+    lower, upper = both(fits, np.float32([4.5, 4.5, 5.2, 18]), np.float32([5.7, 5.7, 6.2, 20]), 2.0, config)
+    # 2 (.1 + .1) (.3 + .5) = .32; without a fit 2 (.1 + .5) (.3 + .5) = .96; a cut beyond the disparity leaves .3
+    assert_allclose(lower, [5 - 0.32, 5 - 0.96, 5 - 0.12, 19 - 0.52], rtol=1e-6)
+    assert_allclose(upper, [5 + 0.4, 5 + 1.2, 5 + 0.6, 19 + 0.52], rtol=1e-6)
+    wide = both(fits, np.float32([4.5] * 4), np.float32([5.7] * 4), 1000.0, config)
+    assert_array_equal(wide, [[0] * 4, [20] * 4])
+
+
+def test_refined__only_where_it_is_kept():
+    config = load_config({"preset": "satellite", "disparity": {"minimum": 0, "maximum": 6}})
+    left, right = pair(40, 60, shift=2.4)
+    rows = Window(0, 0, *left.shape)
+    views = [
+        cut(whole_view(np.ma.array(image)), window)
+        for image, window in zip((left, right), pixel_windows(rows, config), strict=True)
+    ]
+    disparity, kept = np.full(left.shape, np.float32(2)), np.ones(left.shape, bool)
+    kept[:, 30:] = False
+    found = refined(disparity, kept, *pixels_of((views[0], views[1])), 0)
+    assert np.isfinite(found.deviation[4:36, 8:24]).mean() > 0.8
+    assert_allclose(np.median(found.disparity[4:36, 8:24]), 2.4, atol=0.05)
+    assert_array_equal(found.disparity[:, 30:], 2)
+    assert np.isnan(found.deviation[:, 30:]).all()
