@@ -605,7 +605,7 @@ def on_plane(disparity, deviation, r, c):
     """Section 19: the middle of the plane through the disparities around a pixel with a fit."""
     if np.isnan(deviation[r, c]):
         return disparity[r, c]
-    window, down, across = around(disparity.shape, r, c)
+    window, down, across = around(disparity.shape, r, c, 4)
     x = disparity[window].astype(np.float64) - disparity[r, c]
     told = np.abs(x) <= 0.75
     weight = 1 / (np.nan_to_num(deviation[window][told].astype(np.float64), nan=1.0) ** 2 + 0.01)

@@ -12,21 +12,24 @@ from sat_intervals.kernels.rows import cubic_weights
 
 # Columns that the right image needs on either side of those that the search range faces.
 MARGIN = 4
-# Pixels from the middle of a window to its sides.
-RADIUS = 2
+# Pixels from the middle of a window to its sides, of fits and of planes.
+FIT, PLANE = 2, 4
 # Deviation in pixels of a disparity before its fit, which holds an uncertain shift back.
 _BEFORE = 0.25
 # Deviation in pixels of a disparity without a fit, for planes; what is added to that of a fit.
 _NONE, _LEAST = np.float32(1.0), np.float32(0.1)
 # Largest difference of disparities on one surface, in pixels: for a fit, and for a plane.
-_SURFACE, _PLANE = np.float32(1.0), np.float32(0.75)
+_SURFACE, _FLAT_SURFACE = np.float32(1.0), np.float32(0.75)
 # Fewest pixels of a fit, smallest gain that counts as likeness, largest move in pixels.
 _FEWEST, _LIKENESS, _MOVE = 6, 0.1, 1.0
 # Part of the texture along the row that a gain and a constant may explain; slopes of a plane weigh this much less.
 _TEXTURE, _FLAT = 1e-5, 1e-3
 _PIECE = 256
-_SIDE, _WIDE = 2 * RADIUS + 1, _PIECE + 2 * RADIUS
-_LAYER, _MIDDLE = _SIDE * _WIDE, RADIUS * _WIDE + RADIUS
+# Of the pixels around a piece: lines, pixels of a line, pixels, and place of the first middle.
+_LINES, _WIDE = 2 * FIT + 1, _PIECE + 2 * FIT
+_LAYER, _MIDDLE = _LINES * _WIDE, FIT * _WIDE + FIT
+_PLANE_LINES, _PLANE_WIDE = 2 * PLANE + 1, _PIECE + 2 * PLANE
+_PLANE_LAYER, _PLANE_MIDDLE = _PLANE_LINES * _PLANE_WIDE, PLANE * _PLANE_WIDE + PLANE
 
 
 @cached
@@ -63,15 +66,16 @@ def facing_values(right, disparity, minimum):
 
 
 @inlined
-def _load(layer, near, r, first):
-    """Copy the rows around row ``r``, from column ``first - RADIUS`` on; NaN outside."""
+def _load(layer, near, r, first, radius):
+    """Copy the rows around row ``r``, from column ``first - radius`` on; NaN outside."""
     rows, columns = layer.shape
-    for i in range(_SIDE):
-        row = r + i - RADIUS
-        for c in range(_WIDE):
-            column = first + c - RADIUS
+    wide = _PIECE + 2 * radius
+    for i in range(2 * radius + 1):
+        row = r + i - radius
+        for c in range(wide):
+            column = first + c - radius
             inside = 0 <= row < rows and 0 <= column < columns
-            near[i * _WIDE + c] = layer[row, column] if inside else np.float32(np.nan)
+            near[i * wide + c] = layer[row, column] if inside else np.float32(np.nan)
 
 
 @part
@@ -79,10 +83,10 @@ def _fit_sums(near, sums):
     """Sums over the windows of a piece, from the middle's values: count, v, g, b, vv, gg, bb, vg, vb, gb."""
     zero, one = np.float32(0), np.float32(1)
     sums[:] = 0
-    for i in range(_SIDE):
+    for i in range(_LINES):
         for c in range(_PIECE):
             n = tv = tg = tb = vv = gg = bb = vg = vb = gb = zero
-            for j in range(_SIDE):
+            for j in range(_LINES):
                 here = i * _WIDE + j + c
                 b, v = near[here] - near[_MIDDLE + c], near[_LAYER + here] - near[_LAYER + _MIDDLE + c]
                 g, x = near[2 * _LAYER + here], near[3 * _LAYER + here] - near[3 * _LAYER + _MIDDLE + c]
@@ -146,10 +150,10 @@ def least_squares(left, value, slope, disparity):
     near, sums = np.empty(4 * _LAYER, np.float32), np.empty(10 * _PIECE, np.float32)
     for r in range(rows):
         for first in range(0, columns, _PIECE):
-            _load(left, near, r, first)
-            _load(value, near[_LAYER:], r, first)
-            _load(slope, near[2 * _LAYER :], r, first)
-            _load(disparity, near[3 * _LAYER :], r, first)
+            _load(left, near, r, first, FIT)
+            _load(value, near[_LAYER:], r, first, FIT)
+            _load(slope, near[2 * _LAYER :], r, first, FIT)
+            _load(disparity, near[3 * _LAYER :], r, first, FIT)
             _fit_sums(near, sums)
             for c in range(min(_PIECE, columns - first)):
                 shift[r, first + c], deviation[r, first + c] = _fit(sums, c)
@@ -161,15 +165,15 @@ def _plane_sums(near, sums):
     """Sums over the windows of a piece, x from the middle's: w, wi, wj, wii, wij, wjj, wx, wxi, wxj."""
     zero = np.float32(0)
     sums[:] = 0
-    for i in range(_SIDE):
-        down = np.float32(i - RADIUS)
+    for i in range(_PLANE_LINES):
+        down = np.float32(i - PLANE)
         for c in range(_PIECE):
             tw = wj = wjj = wx = wxj = zero
-            for j in range(_SIDE):
-                here, across = i * _WIDE + j + c, np.float32(j - RADIUS)
-                x = near[here] - near[_MIDDLE + c]
-                told = abs(x) <= _PLANE
-                w, x = near[_LAYER + here] if told else zero, x if told else zero
+            for j in range(_PLANE_LINES):
+                here, across = i * _PLANE_WIDE + j + c, np.float32(j - PLANE)
+                x = near[here] - near[_PLANE_MIDDLE + c]
+                told = abs(x) <= _FLAT_SURFACE
+                w, x = near[_PLANE_LAYER + here] if told else zero, x if told else zero
                 tw, wj, wjj = tw + w, wj + w * across, wjj + w * across * across
                 wx, wxj = wx + w * x, wxj + w * x * across
             sums[c] += tw
@@ -208,11 +212,11 @@ def on_planes(disparity, deviation):
             d = _NONE if np.isnan(deviation[r, c]) else deviation[r, c]
             weight[r, c] = np.float32(1) / (d * d + _LEAST * _LEAST)
     result = disparity.copy()
-    near, sums = np.empty(2 * _LAYER, np.float32), np.empty(9 * _PIECE, np.float32)
+    near, sums = np.empty(2 * _PLANE_LAYER, np.float32), np.empty(9 * _PIECE, np.float32)
     for r in range(rows):
         for first in range(0, columns, _PIECE):
-            _load(disparity, near, r, first)
-            _load(weight, near[_LAYER:], r, first)
+            _load(disparity, near, r, first, PLANE)
+            _load(weight, near[_PLANE_LAYER:], r, first, PLANE)
             _plane_sums(near, sums)
             for c in range(min(_PIECE, columns - first)):
                 if not np.isnan(deviation[r, first + c]):

@@ -5,13 +5,13 @@ from typing import NamedTuple
 import numpy as np
 
 from sat_intervals.config import Config
-from sat_intervals.kernels.refinement import MARGIN, RADIUS, facing_values, least_squares, on_planes
+from sat_intervals.kernels.refinement import FIT, MARGIN, PLANE, facing_values, least_squares, on_planes
 from sat_intervals.tiling import Views, Window
 
 # Rows above and below that a refined disparity depends on: windows of fits, and of planes.
-HALO = 2 * RADIUS
+HALO = FIT + PLANE
 # Deviation in pixels that stands for a pixel without a fit, and what adds to a deviation and to a side of the cut.
-_NO_FIT, _LEAST, _SIDE = np.float32(0.5), np.float32(0.1), np.float32(0.3)
+_NO_FIT, _LEAST, _SIDE = np.float32(0.5), np.float32(0.2), np.float32(0.3)
 
 
 class Refined(NamedTuple):
@@ -52,7 +52,7 @@ def both(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the bounds that cost curve and fit give together, inside the search range.
 
-    On either side ``factor (.1 + deviation) (.3 + distance to the bound of the cut)`` from the disparity.
+    On either side ``factor (.2 + deviation) (.3 + distance to the bound of the cut)`` from the disparity.
     """
     disparity, search = fits.disparity, config.disparity
     scale = np.float32(factor) * (_LEAST + np.where(np.isnan(fits.deviation), _NO_FIT, fits.deviation))
