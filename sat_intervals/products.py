@@ -41,7 +41,7 @@ FLAGS = (
     Flag(0, "left_window", "the left window meets the image's border, no data or a mask", True),
     Flag(1, "no_candidate", "all candidates impossible: outside the right image or on its no data", True),
     Flag(2, "range_incomplete", "part of the search range could not be searched", False),
-    Flag(3, "not_refined", "sub-pixel refinement not done", False),
+    Flag(3, "not_refined", "V-fit not done", False),
     Flag(6, "left_masked", "the left pixel is masked", True),
     Flag(7, "right_masked", "all candidates impossible, at least one through the right mask", True),
     Flag(8, "occlusion", "rejected by cross-checking: occlusion", True),
@@ -90,8 +90,12 @@ BANDS = (
     Band("confidence", "", "confidence from ambiguity, 0 to 1, high = unambiguous"),
 )
 
-# A fifth band, if it is asked for.
-SIGMA = Band("sigma", "px", "standard deviation of the least-squares fit of the disparity, no data without one")
+_SIGMA = Band("sigma", "px", "standard deviation of the least-squares fit of the disparity, no data without one")
+
+
+def interval_bands(*, sigma: bool) -> tuple[Band, ...]:
+    """Return the bands of a run, with a fifth one of deviations if they are asked for."""
+    return (*BANDS, _SIGMA) if sigma else BANDS
 
 
 class Bands(NamedTuple):

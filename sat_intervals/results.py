@@ -14,7 +14,7 @@ from sat_intervals.config import Config, Regularization, load_config
 from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.kernels.rows import RowOffsets
-from sat_intervals.products import BANDS, Bands
+from sat_intervals.products import BANDS, Bands, interval_bands
 from sat_intervals.raster import Georeferencing, Image, check_not_replaced, open_image, read_layers, read_tags
 from sat_intervals.raster.images import opened
 from sat_intervals.raster.published import is_surface_of, tags_beside
@@ -179,9 +179,8 @@ def open_run(out: str | Path) -> Run:
     except ValueError as error:
         where = ", see " + ".".join(map(str, error.errors()[0]["loc"])) if isinstance(error, ValidationError) else ""
         raise SatIntervalsError(f"{file} is not the report of a run{where}: match again with --overwrite") from error
-    more = {"intervals.tif": config.products.sigma}
-    needed = {name: (bands + more.get(name, 0), region.height, region.width) for name, bands in _BANDS.items()}
-    places = [_place(file.with_name(name), shape) for name, shape in needed.items()]
+    counts = {**_BANDS, "intervals.tif": len(interval_bands(sigma=config.products.sigma))}
+    places = [_place(file.with_name(name), (n, region.height, region.width)) for name, n in counts.items()]
     return Run(file.parent, report, config, region, places[-1])
 
 

@@ -583,7 +583,7 @@ def fit(left, value, slope, disparity, r, c):
         return nothing
     window, _, _ = around(left.shape, r, c)
     b, v, g = (image[window].astype(np.float64) for image in (left, value, slope))
-    told = (np.abs(disparity[window] - disparity[r, c]) <= 1) & np.isfinite(b) & np.isfinite(v)
+    told = (np.abs(disparity[window] - disparity[r, c]) <= 1) & np.isfinite(b) & np.isfinite(v) & np.isfinite(g)
     if told.sum() < 6:
         return nothing
     b, v, g = b[told] - left[r, c], v[told] - value[r, c], g[told]

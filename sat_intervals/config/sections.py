@@ -193,7 +193,7 @@ class Refinement(Section):
     """Sub-pixel refinement of the disparity."""
 
     method: Literal["least_squares", "vfit"] = Field(
-        "least_squares", description="V through the winner's cost and its neighbours, or grey values as well"
+        "least_squares", description="grey values around the winner, or a V through three costs"
     )
 
 

@@ -10,7 +10,6 @@ import numpy as np
 
 from sat_intervals.config import Config, Interval, Mccnn, load_config
 from sat_intervals.config.pairs import Pair
-from sat_intervals.config.sections import Refinement
 from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.disparity import criteria_of, evaluate
@@ -117,7 +116,7 @@ def _all_methods(
 
 def _of_method(rows: RawRows, method: str, config: Config) -> tuple[RawRows, Config]:
     """Return products and settings of one method: only the last is regularised, the baseline is not filtered."""
-    config = config.model_copy(update={"refinement": Refinement(method="vfit")})  # that of the paper
+    config = config.model_copy(update={"refinement": None})  # V-fit, as in the paper, is done
     if method != METHODS[-1]:
         config = config.model_copy(update={"regularization": None})
     if method == "baseline":

@@ -13,7 +13,7 @@ from sat_intervals.products import Bands
 
 _WIDTH, _RATIO, _CONFIDENCE = 100, 1000, 1000  # steps a unit
 _LARGEST_RATIO = 100
-_FRACTIONS = 16  # of a pixel
+_FRACTIONS, _EXACT = 16, 1e-9  # of a pixel; smallest variance, in squares of the mean
 
 
 @dataclass(frozen=True)
@@ -114,9 +114,9 @@ class _Locking:
         known = self._count > 0
         if known.sum() < 2:
             return None
-        count, total = self._count.sum(), self._sum.sum()
-        between = (self._sum[known] ** 2 / self._count[known]).sum() - total**2 / count
-        return share(between, self._squares.sum() - total**2 / count)
+        mean = self._sum.sum() ** 2 / self._count.sum()
+        between, all_of = (self._sum[known] ** 2 / self._count[known]).sum() - mean, self._squares.sum() - mean
+        return share(max(between, 0.0), all_of) if all_of > _EXACT * mean else None
 
 
 class Metrics:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.products import BANDS, FLAGS, SURFACE, Band
+from sat_intervals.products import FLAGS, SURFACE, Band, interval_bands
 from sat_intervals.raster import footprint, read_layers, read_place, write_file
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import strips
@@ -94,7 +94,12 @@ def _link(run: Run, side: str) -> dict[str, str]:
 
 def _assets(run: Run) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the key and the content of each asset; surface and maps of other runs are left out."""
-    yield "intervals", _raster(run, "intervals.tif", "Disparity, its interval, confidence", BANDS)
+    yield (
+        "intervals",
+        _raster(
+            run, "intervals.tif", "Disparity, its interval, confidence", interval_bands(sigma=run.config.products.sigma)
+        ),
+    )
     yield "validity", _raster(run, "validity.tif", "Validity flags", (_VALIDITY,))
     if run.has_current("dsm.tif"):
         yield "dsm", _raster(run, "dsm.tif", "Surface model with intervals", SURFACE)

@@ -22,7 +22,7 @@ _NONE, _LEAST = np.float32(1.0), np.float32(0.1)
 _SURFACE, _FLAT_SURFACE = np.float32(1.0), np.float32(0.75)
 # Fewest pixels of a fit, smallest gain that counts as likeness, largest move in pixels.
 _FEWEST, _LIKENESS, _MOVE = 6, 0.1, 1.0
-# Part of the texture along the row that a gain and a constant may explain; slopes of a plane weigh this much less.
+# Least share of the variance of slopes that is not that of values; what is added to the squares of a plane's slopes.
 _TEXTURE, _FLAT = 1e-5, 1e-3
 _PIECE = 256
 # Of the pixels around a piece: lines, pixels of a line, pixels, and place of the first middle.
@@ -42,7 +42,7 @@ def facing_values(right, disparity, minimum):
     right: ``(rows, columns + count - 1 + 2 MARGIN)`` float32, NaN for no data; the pixel at ``c + k + MARGIN`` faces
         ``c`` at the disparity ``minimum + k``.
     disparity: ``(rows, columns)`` float32, NaN for none.
-    Returns two such arrays, NaN where a pixel that they are made of has no data.
+    Returns two such arrays, NaN where one of the 4 or 8 pixels that they are made of has no data.
     """
     rows, columns = disparity.shape
     value = np.full((rows, columns), np.float32(np.nan))
@@ -90,7 +90,7 @@ def _fit_sums(near, sums):
                 here = i * _WIDE + j + c
                 b, v = near[here] - near[_MIDDLE + c], near[_LAYER + here] - near[_LAYER + _MIDDLE + c]
                 g, x = near[2 * _LAYER + here], near[3 * _LAYER + here] - near[3 * _LAYER + _MIDDLE + c]
-                told = abs(x) <= _SURFACE and abs(b) < np.inf and abs(v) < np.inf
+                told = abs(x) <= _SURFACE and abs(b) < np.inf and abs(v) < np.inf and abs(g) < np.inf
                 b, v, g = b if told else zero, v if told else zero, g if told else zero
                 n += one if told else zero
                 tv, tg, tb = tv + v, tg + g, tb + b
@@ -139,7 +139,8 @@ def least_squares(left, value, slope, disparity):
     """Shifts of disparities that make right values most like left ones in a window, and their standard deviations.
 
     ``left = gain (value + slope shift) + constant`` on the pixels of the middle's surface, each at its own disparity:
-    one Gauss-Newton step of least-squares matching (Gruen 1985).
+    one Gauss-Newton step of least-squares matching (Gruen 1985). The shift is that times the share of _BEFORE^2 in
+    _BEFORE^2 + deviation^2.
 
     left, value, slope, disparity: ``(rows, columns)`` float32, NaN for none, see `facing_values`.
     Returns ``(shift, deviation)``, float32 pixels of the same shape, NaN for none.

@@ -55,15 +55,15 @@ def choose(pool: Pool, ladders: Ladders, coverage: float) -> tuple[Levels, list[
             borrowed = f": the level of {other} confidence is used" if borrows else ""
             notes.append(f"{number} pixels of {name} confidence, {needed} are needed{borrowed}")
     high = _level(table[:, HIGH + (few[0] and borrows)], ladders.high, coverage)
-    if high is None:
+    if high is None and pixels[0]:
         notes.append("high confidence does not reach it at any level")
     most = float(ladders.low[-1])
     low: tuple[float, float | None] | None
     if few[1] and borrows:
         low = most if high is None else high, _USUAL_QUANTILE
-    elif (low := _best(table, ladders.low, coverage)) is None:
+    elif (low := _best(table, ladders.low, coverage)) is None and pixels[1]:
         notes.append("low confidence does not reach it at any level")
-    reached = high is not None and low is not None
+    reached = not any(number and level is None for number, level in zip(pixels, (high, low), strict=True))
     level, quantile = low or (most, QUANTILES[int(np.argmax(table[-1, HIGH + 1 :, INSIDE]))])  # it comes nearest
     high = float(ladders.high[-1]) if high is None else high
     return Levels(coverage=coverage, high=high, low=level, quantile=quantile, reached=reached), notes

@@ -18,7 +18,7 @@ from sat_intervals.match.rows import Survey
 from sat_intervals.match.sampling import look, spots
 from sat_intervals.match.search_range import Found, NoRangeError, find_range, finest_step, reduced, with_range
 from sat_intervals.match.whole import cut, match_whole, whole_view
-from sat_intervals.products import BANDS, flag_attributes
+from sat_intervals.products import flag_attributes, interval_bands
 from sat_intervals.tiling import Window
 
 _LOG = logging.getLogger(__name__)
@@ -42,9 +42,9 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
     Returns
     -------
     Dataset
-        ``disparity``, ``lower``, ``upper`` (pixels), ``confidence`` (0 to 1), float32, and ``validity``, uint16
-        flags; with the dimensions and coordinates of a left DataArray. The attribute ``rows`` has the row offsets that
-        were taken out of the right image, as JSON.
+        ``disparity``, ``lower``, ``upper`` (pixels), ``confidence`` (0 to 1), float32, ``validity``, uint16 flags, and
+        ``sigma`` (pixels) if the settings ask for it; with the dimensions and coordinates of a left DataArray. The
+        attribute ``rows`` has the row offsets that were taken out of the right image, as JSON.
 
     Raises
     ------
@@ -76,7 +76,8 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
     final = match_whole(*images, config, statistics, ranges)
     labels = left if isinstance(left, xr.DataArray) else xr.DataArray(images[0], dims=("row", "column"))
     dataset = xr.Dataset(coords=labels.coords, attrs={"rows": json.dumps(asdict(rows))} if rows else {})
-    for band, layer in zip(BANDS, final[:4], strict=True):
+    layers = (*final[:4], final.sigma) if config.products.sigma else final[:4]
+    for band, layer in zip(interval_bands(sigma=config.products.sigma), layers, strict=True):
         attributes = {"long_name": band.meaning} | ({"units": band.unit} if band.unit else {})
         dataset[band.name] = xr.DataArray(layer, dims=labels.dims, attrs=attributes)
     dataset["validity"] = xr.DataArray(final.validity, dims=labels.dims, attrs=flag_attributes())

@@ -60,7 +60,7 @@ class Ladders(NamedTuple):
     """Rungs of both classes, ascending float64 ``(rungs,)``: the last ones hold every possible candidate.
 
     low: levels at which pairs are matched.
-    high: the same; with least squares factors of intervals, see `refinement.both`.
+    high: the same; with least squares factors of intervals, see `refinement.bounds_of_both`.
     """
 
     high: np.ndarray

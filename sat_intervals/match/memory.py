@@ -17,8 +17,9 @@ _VIEW_BYTES = 20
 # Pixels of a piece of a strip, in whole rows, and bytes for each: raw products, final bands and temporary arrays.
 STRIP_PIXELS = 1 << 19
 _PIECE_BYTES, _PIECE_ROWS = 100, 64
-# With least squares: more temporary arrays, and per pixel of a strip the pixels of both images.
-_FIT_BYTES, _IMAGES_BYTES = 60, 8
+# With least squares: more temporary arrays, per pixel of a strip the pixels of both images, and, before there are
+# bands, what reading them needs, at the rows of a function.
+_FIT_BYTES, _IMAGES_BYTES, _READING_BYTES = 60, 8, 60
 # Per pixel of a strip: final bands, which are compressed one file after another; and per pixel of the columns that are
 # compressed at a time: what is written, read back and compared.
 _BAND_BYTES, _BLOCK_BYTES, _COLUMNS = 18, 64, 2048
@@ -75,10 +76,10 @@ def waiting_bytes(config: Config, size: int | None = None) -> int:
 def strip_bytes(rows: int, width: int, config: Config) -> int:
     """Bytes that finishing a strip of final rows needs on top of its process."""
     piece = (_PIECE_BYTES + config.fits * _FIT_BYTES) * max(STRIP_PIXELS, _PIECE_ROWS * width)
-    bands = rows * width * _BAND_BYTES
-    if config.fits:
-        bands += rows * _IMAGES_BYTES * (width + config.disparity.count)
-    return bands + max(piece, bands // 2 + rows * min(width, _COLUMNS) * _BLOCK_BYTES)
+    bands, facing = rows * width * (_BAND_BYTES + 6 * config.products.sigma), width + config.disparity.count
+    writing = bands // 2 + rows * min(width, _COLUMNS) * _BLOCK_BYTES
+    reading = rows * facing * _READING_BYTES if config.fits and config.rows == "auto" else 0
+    return max(reading, bands + config.fits * rows * facing * _IMAGES_BYTES + piece, bands + writing)
 
 
 def fitted(config: Config, memory: int, tiles_at_once: int = 1, waiting: int = 0) -> Config:

@@ -1,9 +1,8 @@
 """Whole-image steps on raw products: cross-checking, confidence, medians, regularisation, final bands.
 
 All steps work on full-width rows with a halo of rows above and below, so that results do not depend on the tiling
-(METHOD.md, sections 4 and 6 to 9). The order is: winner and V-fit (in the tile), cross-check, median, least
-squares, quantiles,
-widening, NaN for invalid pixels.
+(METHOD.md, sections 4, 6 to 9, and 19). The order is: winner and V-fit (in the tile), cross-check, median, least
+squares, quantiles, widening, NaN for invalid pixels.
 """
 
 from collections.abc import Iterable, Iterator
@@ -17,7 +16,7 @@ from sat_intervals.kernels.disparity import cross_check, median
 from sat_intervals.kernels.intervals import regularize
 from sat_intervals.kernels.matching import Raw, RightView
 from sat_intervals.match.histogram import quantile
-from sat_intervals.match.refinement import HALO, Refined, both, pixels_of, refined
+from sat_intervals.match.refinement import HALO, Refined, bounds_of_both, pixels_of, refined
 from sat_intervals.products import (
     BOUND_STEPS,
     INVALID,
@@ -146,7 +145,7 @@ def filter_rows(rows: RawRows, scale: ConfidenceScale, config: Config) -> Filter
         disparity = median(disparity, kept, config.median.size)
     deviation = _EMPTY
     if config.fits:
-        disparity, deviation = refined(disparity, kept, rows.left, rows.right, config.disparity.minimum)
+        disparity, deviation = refined(disparity, kept, rows.left, rows.right, config)
     written = searched if config.products.keep_rejected else kept
     return Filtered(disparity, lower, upper, confidence, validity, low, written, deviation)
 
@@ -162,7 +161,7 @@ def finish_rows(rows: Filtered, first: int, last: int, config: Config) -> Bands:
         validity[rows.low[inner]] |= REGULARIZED
     if config.fits and cuts:
         assert rows.low is not None  # a coverage needs both classes
-        bounds = both(rows.fits(inner), rows.lower[inner], rows.upper[inner], cuts.high, config)
+        bounds = bounds_of_both(rows.fits(inner), rows.lower[inner], rows.upper[inner], cuts.high, config)
         lower, upper = (np.where(rows.low[inner], old, new) for new, old in zip(bounds, (lower, upper), strict=True))
     disparity = np.where(rows.written[inner], rows.disparity[inner], np.float32(np.nan))
     bands = Bands(disparity, *widened(lower, upper, disparity, config), rows.confidence[inner], validity)
@@ -207,8 +206,11 @@ def _bounds(rows: RawRows, low: np.ndarray | None, kept: np.ndarray, config: Con
     if low is None or not config.bound_steps:
         return _filtered(lower, kept, config), _filtered(upper, kept, config)
     if config.fits:
-        cuts = (_filtered(bound, kept, config) for bound in (rows.lower_low, lower, rows.upper_low, upper))
-        return np.where(low, next(cuts), next(cuts)), np.where(low, next(cuts), next(cuts))
+        lower, upper = (
+            np.where(low, _filtered(of_low, kept, config), _filtered(of_high, kept, config))
+            for of_low, of_high in ((rows.lower_low, lower), (rows.upper_low, upper))
+        )
+        return lower, upper
     lower, upper = np.where(low, rows.lower_low, lower), np.where(low, rows.upper_low, upper)
     return _filtered(lower, kept, config), _filtered(upper, kept, config)
 

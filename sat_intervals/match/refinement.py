@@ -34,20 +34,21 @@ def pixels_of(views: Views) -> tuple[np.ndarray, np.ndarray]:
     return left, right
 
 
-def refined(disparity: np.ndarray, kept: np.ndarray, left: np.ndarray, right: np.ndarray, minimum: int) -> Refined:
-    """Refine disparities that are kept; one that cannot be fitted stays as it is.
+def refined(disparity: np.ndarray, kept: np.ndarray, left: np.ndarray, right: np.ndarray, config: Config) -> Refined:
+    """Refine disparities that are kept; one that cannot be fitted, or would leave the search range, stays as it is.
 
     disparity, kept: ``(rows, columns)`` float32 pixels, and bool.
     left, right: pixels of both images, see `pixel_windows`.
     """
     matched = np.where(kept, disparity, np.float32(np.nan))
-    shift, deviation = least_squares(left, *facing_values(right, matched, minimum), matched)
-    fitted = ~np.isnan(deviation)
-    smooth = on_planes(np.where(fitted, matched + shift, matched), deviation)
-    return Refined(np.where(fitted, smooth, disparity), deviation)
+    search = config.disparity
+    shift, deviation = least_squares(left, *facing_values(right, matched, search.minimum), matched)
+    smooth = on_planes(np.where(np.isnan(deviation), matched, matched + shift), deviation)
+    deviation[(smooth < search.minimum) | (smooth > search.maximum)] = np.nan
+    return Refined(np.where(np.isnan(deviation), disparity, smooth), deviation)
 
 
-def both(
+def bounds_of_both(
     fits: Refined, lower: np.ndarray, upper: np.ndarray, factor: float, config: Config
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the bounds that cost curve and fit give together, inside the search range.

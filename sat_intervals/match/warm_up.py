@@ -10,7 +10,7 @@ from sat_intervals.match.matching_cost import cost_areas
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
 from sat_intervals.match.patch import Frame, frame_area, match_patch, patch_windows
 from sat_intervals.match.postprocess import ConfidenceScale, postprocess_strips
-from sat_intervals.match.whole import raw_rows
+from sat_intervals.match.whole import whole_rows
 from sat_intervals.tiling import View, Window
 
 
@@ -35,4 +35,4 @@ def compile_kernels(config: Config, *, hands_states_on: bool = True) -> None:
     if hands_states_on and config.hands_states_on:
         (cost,) = cost_areas(views, [frame_area(frame, config, ranges)], config, statistics)
         trace_area(cost, frame, borders_of(frame, config, [{} for _ in WAVEFRONTS]), 0, config, ranges)
-    list(postprocess_strips([raw_rows(patch, views, frame.whole, config)], ConfidenceScale(0.0, 1.0), config))
+    list(postprocess_strips([whole_rows(patch, views, frame.whole, config)], ConfidenceScale(0.0, 1.0), config))

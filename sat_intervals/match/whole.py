@@ -27,17 +27,18 @@ def match_whole(
     """
     frame = Frame.of_whole(Window(0, 0, *left.shape))
     windows = patch_windows(frame, config, ranges)
-    views = cut(whole_view(left), windows[0]), cut(whole_view(right), windows[1])
+    whole = whole_view(left), whole_view(right)
+    views = cut(whole[0], windows[0]), cut(whole[1], windows[1])
     patch = match_patch(views, frame, config, statistics, ranges)
     raw, scale = patch.raw, ConfidenceScale(np.nan, np.nan)
     if config.ambiguity:
         histogram = ambiguity_histogram(raw.ambiguity, raw.winner != NO_DISPARITY, config.largest_ambiguity)
         scale = confidence_scale(config.ambiguity, histogram)
-    rows = raw_rows(patch, (whole_view(left), whole_view(right)), frame.whole, config)
+    rows = whole_rows(patch, whole, frame.whole, config)
     return postprocess_rows(rows, 0, frame.whole.height, scale, config)
 
 
-def raw_rows(patch: Patch, views: Views, window: Window, config: Config) -> RawRows:
+def whole_rows(patch: Patch, views: Views, window: Window, config: Config) -> RawRows:
     """Return the rows of a pair that was matched as one tile, with the pixels that the settings need."""
     rows = RawRows.of(patch.raw, patch.right)
     if config.fits:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 from rasterio.io import DatasetWriter
 
-from sat_intervals.products import BANDS, FLAGS, INVALID, POINTS, RANGES, SIGMA, SURFACE, TRUTH, Band
+from sat_intervals.products import BANDS, FLAGS, INVALID, POINTS, RANGES, SURFACE, TRUTH, Band, interval_bands
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ RUN_FILES = (INTERVALS, VALIDITY)
 
 def run_files(compression: str, *, sigma: bool = False) -> tuple[File, File]:
     """Return the files of a run with the compression of the settings, and with the band of deviations."""
-    intervals = replace(INTERVALS, compression=compression, bands=(*BANDS, SIGMA) if sigma else BANDS)
+    intervals = replace(INTERVALS, compression=compression, bands=interval_bands(sigma=sigma))
     return intervals, replace(VALIDITY, compression=compression)
 
 

@@ -302,7 +302,12 @@ def _manifest(
     settings = config.model_dump(mode="json", exclude=_NOT_OF_TILES)
     levels = config.cuts
     if levels is not None:
-        settings["interval"] = {"high": levels.high, "low": levels.low, "steps": config.bound_steps}
+        settings["interval"] = {
+            "high": levels.high,
+            "low": levels.low,
+            "steps": config.bound_steps,
+            "cut": config.fit_cut,
+        }
     return {
         **({"local_ranges": ranges} if ranges else {}),
         **({"rows": asdict(rows)} if rows else {}),

@@ -27,7 +27,7 @@ from sat_intervals.match.postprocess import (
     widened,
     with_halo,
 )
-from sat_intervals.match.refinement import both
+from sat_intervals.match.refinement import bounds_of_both
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.products import INVALID
 from sat_intervals.progress import Progress
@@ -271,7 +271,7 @@ class _Gauge:
         if rung == _OF_FITS:
             fits, lower, upper = piece.rows.fits(piece.inner), piece.of("lower"), piece.of("upper")
             for number, factor in enumerate(self._rungs.high):
-                yield number, HIGH, both(fits, lower, upper, factor, config)
+                yield number, HIGH, bounds_of_both(fits, lower, upper, factor, config)
             return
         for scheme, quantile in enumerate((None, *QUANTILES)):
             if scheme != HIGH or self._rungs.are_one:

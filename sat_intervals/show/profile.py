@@ -78,7 +78,7 @@ def draw_curve(results: Results, target: Path, row: int, column: int, dpi: int =
             # The marker shows an interval of zero width.
             bar = {"color": ORANGE, "lw": 6, "solid_capstyle": "butt", "marker": "|", "ms": 9, "mew": 3, "label": text}
             below.plot([pixel.lower, pixel.upper], [-0.08, -0.08], **bar)
-        lines = [("disparity", curve.disparity, "black", ":")]
+        lines = [("V-fit" if results.config.fits else "disparity", curve.disparity, "black", ":")]
         lines += [("truth", float(pixel.truth), VERMILION, "-")] if np.isfinite(pixel.truth) else []
         for name, place, colour, style in lines:
             shown = across[0] <= place <= across[1]
@@ -101,7 +101,8 @@ def _draw_cut(chart: Axes, curve: Curve, results: Results) -> None:
     chart.plot(inside, curve.possibilities[curve.cut], "o", color=BLUE, ms=6, label="cut")
     wider = not results.config.has_coverage and (curve.lower < inside.min() or curve.upper > inside.max())
     ends = f"{curve.lower:.4g} to {curve.upper:.4g} px"
-    text = f"interval, {ends}:\ncut pushed out by refinement" if wider else f"interval of the cut, {ends}"
+    of_cut = f"cut, {ends}" if results.config.fits else f"interval of the cut, {ends}"
+    text = f"interval, {ends}:\ncut pushed out by refinement" if wider else of_cut
     chart.vlines([curve.lower, curve.upper], 0, 1, color=BLUE, lw=1.2, label=text)
     arrow = {"arrowstyle": "<->", "color": BLUE, "shrinkA": 0, "shrinkB": 0}
     chart.annotate("", (curve.lower, 0.05), (curve.upper, 0.05), arrowprops=arrow)

@@ -91,7 +91,7 @@ def _results(run: Run) -> Iterator[Layer]:
     group, shape, place = "Disparity", run.shape, run.georeferencing
     intervals = Raster(run.out / "intervals.tif", place, shape)
     validity = Raster(run.out / "validity.tif", place, shape)
-    disparity, lower, upper, _ = read_small_layers(intervals.source, _fitting(shape))
+    disparity, lower, upper, *_ = read_small_layers(intervals.source, _fitting(shape))
     counts = np.zeros(1 << 16, np.int64)
     for window in run.windows():
         counts += np.bincount(read_layers(validity.source, window).ravel(), minlength=counts.size)

@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.ndimage import gaussian_filter
 
 from sat_intervals import load_config, match_arrays
-from sat_intervals.match.refinement import Refined, both, pixel_windows, pixels_of, refined
+from sat_intervals.match.refinement import Refined, bounds_of_both, pixel_windows, pixels_of, refined
 from sat_intervals.match.whole import cut, whole_view
 from sat_intervals.products import INVALID, REGULARIZED
 from sat_intervals.tiling import Window
@@ -66,14 +66,26 @@ def test_match_arrays__gives_the_factor_of_the_calibration(matched):
     assert (wide.upper - wide.lower).values[high].mean() > 1.2 * (usual.upper - usual.lower).values[high].mean()
 
 
-def test_both__worked_example():
+def test_match_arrays__of_a_range_too_short_stays_inside_it():
+    """The true shift is beyond the maximum; also with few disparities, where no winner is at an end."""
+    images = pair(shift=4.6)
+    for interval in ({"coverage": 0.9}, {"alpha": 0.05}):
+        settings = {"preset": "satellite", "disparity": {"minimum": 0, "maximum": 4}, "interval": interval}
+        found = match_arrays(*images, settings)
+        valid = found.validity.values & INVALID == 0
+        assert found.disparity.values[valid].max() <= 4
+        assert found.upper.values[valid].max() <= 4.5
+        assert found.lower.values[valid].min() >= -0.5
+
+
+def test_bounds_of_both__worked_example():
     config = load_config({"preset": "satellite", "disparity": {"minimum": 0, "maximum": 20}})
     fits = Refined(np.float32([5, 5, 5, 19]), np.float32([0.1, np.nan, 0.1, 0.1]))
-    lower, upper = both(fits, np.float32([4.5, 4.5, 5.2, 18]), np.float32([5.7, 5.7, 6.2, 20]), 2.0, config)
+    lower, upper = bounds_of_both(fits, np.float32([4.5, 4.5, 5.2, 18]), np.float32([5.7, 5.7, 6.2, 20]), 2.0, config)
     # 2 (.2 + .1) (.3 + .5) = .48; without a fit 2 (.2 + .5) (.3 + .5) = 1.12; a cut beyond the disparity leaves .3
     assert_allclose(lower, [5 - 0.48, 5 - 1.12, 5 - 0.18, 19 - 0.78], rtol=1e-6)
     assert_allclose(upper, [5 + 0.6, 5 + 1.4, 5 + 0.9, 19 + 0.78], rtol=1e-6)
-    wide = both(fits, np.float32([4.5] * 4), np.float32([5.7] * 4), 1000.0, config)
+    wide = bounds_of_both(fits, np.float32([4.5] * 4), np.float32([5.7] * 4), 1000.0, config)
     assert_array_equal(wide, [[0] * 4, [20] * 4])
 
 
@@ -87,7 +99,7 @@ def test_refined__only_where_it_is_kept():
     ]
     disparity, kept = np.full(left.shape, np.float32(2)), np.ones(left.shape, bool)
     kept[:, 30:] = False
-    found = refined(disparity, kept, *pixels_of((views[0], views[1])), 0)
+    found = refined(disparity, kept, *pixels_of((views[0], views[1])), config)
     assert np.isfinite(found.deviation[4:36, 8:24]).mean() > 0.8
     assert_allclose(np.median(found.disparity[4:36, 8:24]), 2.4, atol=0.05)
     assert_array_equal(found.disparity[:, 30:], 2)
