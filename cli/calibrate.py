@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from sat_intervals.run.measure import Subject
 
 _CALIBRATION = """\
-# Calibration: levels of the cost curve that reach a coverage, found by sat-intervals calibrate.
+# Calibration: levels of the cost curve, and factors, that reach a coverage, found by sat-intervals calibrate.
 # Use it with: sat-intervals match LEFT RIGHT OUT --coverage 0.9 --calibration FILE, with the settings of `key`.
 # `expected`: figures of pairs with the levels found on the other pairs; coverage of all, high and low confidence.
 """

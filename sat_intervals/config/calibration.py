@@ -41,7 +41,8 @@ class Levels(StrictModel):
 
     ``high`` and ``low``, of pixels of high and low confidence, are the excess ``S(d) - min S`` of the aggregated cost,
     in the unit of the kernels' integer costs: the sum over the 8 paths of SGM (one cost without SGM), times the `steps`
-    of the matching cost (1 for Census, 125 for MC-CNN). ``quantile`` None leaves low-confidence segments as they are.
+    of the matching cost (1 for Census, 125 for MC-CNN). With least squares ``high`` is a factor instead, see
+    `refinement.bounds_of_both`. ``quantile`` None leaves low-confidence segments as they are.
     ``reached`` is False if the pairs of the calibration did not reach the coverage at any level.
     """
 
