@@ -1,7 +1,8 @@
 """Measure intervals that were made at a ladder of levels against a truth (docs/coverage.md).
 
 Every pair is matched at each rung of the levels, through the whole chain; factors are tried on one cut. Confidence
-classes are `HIGH` and low. Low-confidence pixels are measured once for each quantile of the regularisation, and once without it.
+classes are `HIGH` and low. Low-confidence pixels are measured once for each quantile of the regularisation, and once
+without it.
 
 Letters of shapes: rungs (levels of the ladder), schemes (high, then low with each of QUANTILES), fields.
 """
