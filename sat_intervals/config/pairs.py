@@ -37,6 +37,7 @@ _TOLERANCE = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 _SENSORS = ("left_model", "right_model", "left_grid", "right_grid")
 # YAML nodes allowed in a list of pairs, which may have thousands of rows.
 _NODES = 200_000
+_INTEGER = TypeAdapter(int)  # also of 14.0
 
 
 @dataclass(frozen=True)
@@ -168,7 +169,7 @@ def _of_table(file: Path) -> list[Pair]:
     for place, row in _rows(file, _COLUMNS):
         minimum, maximum = row["minimum"], row["maximum"]
         try:
-            search = int(minimum), int(maximum)
+            search = _INTEGER.validate_python(minimum), _INTEGER.validate_python(maximum)
         except ValueError as error:
             raise SatIntervalsError(f"{place}: minimum {minimum!r}, maximum {maximum!r}, needed: integers") from error
         left, right, truth = (file.parent / row[image] for image in ("left", "right", "truth"))
@@ -255,7 +256,11 @@ def _rows(file: Path, needed: Sequence[str]) -> list[tuple[str, dict[str, Any]]]
 
 
 def _rows_of_csv(text: str) -> list[Any]:
-    rows = csv.DictReader(io.StringIO(text, newline=""))
-    if twice := [name for name, count in Counter(rows.fieldnames or ()).items() if count > 1]:
+    """Read rows as programs and spreadsheets write them: semicolons, spaces, capitals, empty rows."""
+    delimiter = max(",;\t", key=text.partition("\n")[0].count)
+    rows = csv.DictReader(io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True)
+    rows.fieldnames = [name.strip().lower() for name in rows.fieldnames or ()]
+    if twice := [name for name, count in Counter(filter(None, rows.fieldnames)).items() if count > 1]:
         raise ValueError(f"column {twice[0]} appears twice")
-    return list(rows)
+    trimmed = ({key: value.strip() if isinstance(value, str) else value for key, value in row.items()} for row in rows)
+    return [row for row in trimmed if any(row.values())]

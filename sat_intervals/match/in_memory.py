@@ -112,7 +112,7 @@ def _found(left: np.ma.MaskedArray, right: np.ma.MaskedArray) -> Found:
     step = finest_step(left.shape[0], max(left.shape[1], right.shape[1]))
     small = [reduced(image.filled(0), np.ma.getmaskarray(image).view(np.uint8), step) for image in (left, right)]
     try:
-        return find_range(small[0], small[1], step, left.shape)[0]
+        return find_range(small[0], small[1], step, left.shape)[0].fitted(right.shape[1])
     except NoRangeError as error:
         raise NoRangeError(
             f"the arrays have no common search range: {error}: give disparity minimum and maximum"

@@ -4,7 +4,7 @@ A level has its step: the images averaged over ``rows x columns`` pixels. The co
 one within what the level before found. Disparities of a level are in its own pixels; times the step they are in pixels.
 """
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -90,6 +90,11 @@ class Found:
         """Return the local ranges."""
         return LocalRanges.of_report(self.cells)
 
+    def fitted(self, columns: int) -> "Found":
+        """Return the range cut at both ends to as many disparities as the right image has columns."""
+        beyond = max(0, self.maximum - self.minimum + 1 - columns)
+        return replace(self, minimum=self.minimum + beyond // 2, maximum=self.maximum - (beyond - beyond // 2))
+
     def report(self) -> dict[str, Any]:
         """Return the mapping that the store and run.json hold."""
         return asdict(self) | {"levels": [asdict(level) for level in self.levels]}
@@ -143,8 +148,9 @@ def reduced(pixels: np.ndarray, state: np.ndarray, step: Step) -> np.ndarray:
     Returns float32, NaN where less than half of a block is usable.
     """
     sums, counts = pixels, (state == 0).view(np.uint8)
-    for axis, size in enumerate(step):
-        sums, counts = _added(sums, axis, size), _added(counts, axis, size)
+    with np.errstate(over="ignore"):  # undeclared no data may be as large as a float32 can be
+        for axis, size in enumerate(step):
+            sums, counts = _added(sums, axis, size), _added(counts, axis, size)
     return np.where(2 * counts >= step.rows * step.columns, sums / np.maximum(counts, 1), np.nan).astype(np.float32)
 
 

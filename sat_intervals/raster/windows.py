@@ -19,6 +19,8 @@ from sat_intervals.tiling import View, Views, Window
 _FLOAT32_HOLDS = {"uint8", "int8", "uint16", "int16", "float16", "float32"}
 # Integers up to this are exact in float64.
 _EXACT = 2**53
+# Shares by which floats may differ from a no-data value as people write it, the second one above the third number.
+_DIGITS, _FEW_DIGITS, _LARGE = {"float32": 1e-6}, 1e-3, 1e38
 
 
 def read_views(images: Iterable[Image], windows: Iterable[Window]) -> Views:
@@ -119,10 +121,17 @@ def read_inside(image: Image, window: Window, shape: tuple[int, int] | None = No
 
 
 def _differs(values: np.ndarray, nodata: float | None) -> np.ndarray:
-    """Return where values differ from the no-data value rounded to their type; uint8 never equals 300."""
+    """Return where values differ from the no-data value; uint8 never equals 300.
+
+    A float32 may differ by what seven written digits leave out, and any float by more near the largest ones.
+    """
     if nodata is None:
         return np.ones(values.shape, bool)
     with np.errstate(over="ignore", invalid="ignore"):
+        if values.dtype.kind == "f" and np.isfinite(nodata):
+            share = _FEW_DIGITS if abs(nodata) > _LARGE else _DIGITS.get(values.dtype.name, 0.0)
+            near = share * abs(nodata)
+            return ~((values >= nodata - near) & (values <= nodata + near))
         stored = np.asarray(nodata).astype(values.dtype)
     held = values.dtype.kind == "f" or stored == nodata
     return np.asarray(values != stored) if held else np.ones(values.shape, bool)

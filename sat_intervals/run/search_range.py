@@ -101,7 +101,7 @@ def search_range(workers: Workers, left: Image, right: Image, progress: Progress
             f"{left.path} and {right.path}: {error}: give the search range with --disparity MIN MAX, or check that the "
             "images are an epipolar pair"
         ) from None
-    return replace(found_range, collars=collars)
+    return replace(found_range.fitted(right.width), collars=collars)
 
 
 @contextmanager

@@ -77,6 +77,14 @@ def test_collar__reaches_the_border():
     assert not collar(image, np.inf).any()
 
 
+def test_fitted__has_no_more_disparities_than_the_right_image_has_columns(scene):
+    found = searched(scene.left, scene.right)
+    count = found.maximum - found.minimum + 1
+    assert found.fitted(count) == found
+    cut = found.fitted(count - 3)
+    assert (cut.minimum, cut.maximum) == (found.minimum + 1, found.maximum - 2)
+
+
 def test_found__survives_its_report(scene):
     found = searched(scene.left, scene.right)
     assert Found.of_report(found.report()) == found

@@ -298,8 +298,14 @@ def test_read_batch__reads_the_same_pairs_from_every_kind_of_file(tmp_path):
     (tmp_path / "b.json").write_text(json.dumps([row]))
     (tmp_path / "b.yaml").write_text("- {name: a, left: l.tif, right: 'https://host/r.tif', minimum: -3, sgm.p1: 7}\n")
     (tmp_path / "b.csv").write_text("name,left,right,minimum,sgm.p1\na,l.tif,https://host/r.tif,-3,7\n")
-    batches = [read_batch(tmp_path / f"b.{ending}") for ending in ("json", "yaml", "csv")]
-    assert batches[0] == batches[1] == batches[2]
+    # as spreadsheets write it
+    (tmp_path / "c.csv").write_text(
+        "\ufeffName; Left;RIGHT ;minimum;sgm.p1\r\n;;;;\r\na; l.tif;https://host/r.tif ;-3;7\r\n;;;;\r\n"
+    )
+    (tmp_path / "d.csv").write_text("name, left, right, minimum, sgm.p1\n\na, l.tif, https://host/r.tif, -3, 7\n")
+    files = ("b.json", "b.yaml", "b.csv", "c.csv", "d.csv")
+    batches = [read_batch(tmp_path / name) for name in files]
+    assert all(batch == batches[0] for batch in batches)
     pair = batches[0][0]
     assert (pair.left, pair.right) == (str(tmp_path / "l.tif"), "https://host/r.tif")
     assert pair.settings == {"disparity": {"minimum": -3}, "sgm": {"p1": 7}}
