@@ -1,9 +1,8 @@
 """Estimate the constant shift between heights at points and a surface of heights.
 
-The shift is that of Nuth and Kaab (2011), easting, northing and height. They solve it from slope and aspect by least
-squares, which needs smooth ground. In towns the horizontal part shows at walls only. So here the mean of clipped
-differences is minimised itself, by a search in ever smaller steps. xdem registers whole rasters in memory, and states
-no uncertainty.
+The shift is that of Nuth and Kaab (2011), easting, northing and height. A place near it is found by a search in ever
+smaller steps for the least mean clipped difference, since in towns the horizontal part shows at walls only; from there
+it is solved from slopes. xdem registers whole rasters in memory, and states no uncertainty.
 
 The surface is cut into blocks. Differences within a block are correlated, so uncertainties come from what differs
 between blocks.
@@ -35,10 +34,13 @@ _SEARCHED, _LEAST_BLOCKS = 8_000, 4
 _CLIP, _FLOOR = 3.0, 1.0
 # Cells of the shift that must raise the loss: by so many cells, and by so many standard errors.
 _PROBE, _LEAST_RISE, _CLEARLY = 4.0, 0.02, 5.0
-# Standard deviation that interpolation between cells adds, in cells: no spread between blocks shows it.
-_BETWEEN = 0.1
+# Standard deviation that interpolation between cells adds, in cells: no spread between blocks shows it. A shift is made
+# from so many deviations on.
+_BETWEEN, _CERTAIN = 0.1, 2.0
 # Makes a median of absolute values a standard deviation.
 _NORMAL = 1.4826
+# Cells to either side that slopes are taken from: two estimates whose noise is independent. Steps of the solution.
+_NARROW, _WIDE, _SOLVED = 1, 2, 10
 _DIRECTIONS = np.array([[1.0, 0.0], [0.0, 1.0], [0.7071, 0.7071], [0.7071, -0.7071]])
 
 
@@ -95,9 +97,10 @@ def put_together(parts: Sequence[tuple[np.ndarray, ...]], cell: float, moves: in
 class Registration(NamedTuple):
     """A shift in metres, easting, northing and height, to be added to what moves.
 
-    shift, deviation: ``(3,)``, with the standard deviation; without a horizontal part, 0 with deviation NaN.
+    shift, deviation: ``(3,)``, with the standard deviation; a shift of less than two of them is 0. Without a horizontal
+        part, 0 with deviation NaN.
     used: number of points used.
-    before, after: differences of what stands still - what moves, of all points, without and with the shift.
+    before, after: differences of what stands still - what moves, of the same points, without and with the shift.
     """
 
     shift: np.ndarray
@@ -120,19 +123,35 @@ class Registration(NamedTuple):
 
 
 @cached
-def sampled(surface, block, x, y):
-    """Return ``(n,)`` bilinear heights, NaN where unknown."""
-    result = np.full(x.size, np.nan)
+def slopes(surface, block, x, y, reach):
+    """Return ``(n, 2)`` slopes of the nearest cells, down the rows and along the columns; NaN where unknown.
+
+    They are means of three lines, over ``reach`` cells to each side.
+    """
+    result = np.full((x.size, 2), np.nan)
     _, rows, columns = surface.shape
     for n in range(x.size):
-        if not (0 <= x[n] <= columns - 1 and 0 <= y[n] <= rows - 1):
-            continue
-        i, j = min(int(y[n]), rows - 2), min(int(x[n]), columns - 2)
-        v, u = y[n] - i, x[n] - j
-        upper = (1 - u) * surface[block[n], i, j] + u * surface[block[n], i, j + 1]
-        lower = (1 - u) * surface[block[n], i + 1, j] + u * surface[block[n], i + 1, j + 1]
-        result[n] = (1 - v) * upper + v * lower
+        i, j = int(np.floor(y[n] + 0.5)), int(np.floor(x[n] + 0.5))
+        if reach <= i < rows - reach and reach <= j < columns - reach:
+            here = surface[block[n]]
+            down = across = 0.0
+            for k in range(-1, 2):
+                down += here[i + reach, j + k] - here[i - reach, j + k]
+                across += here[i + k, j + reach] - here[i + k, j - reach]
+            result[n] = down / (6 * reach), across / (6 * reach)
     return result
+
+
+def sampled(surface: np.ndarray, block: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return ``(n,)`` heights of the nearest cell and its slope, NaN where unknown.
+
+    Interpolation between cells averages their noise: halfway, differences would be smaller than at the true shift.
+    """
+    _, rows, columns = surface.shape
+    slope = slopes(surface, block, x, y, _WIDE)
+    row, column = (np.floor(place + 0.5) for place in (y, x))
+    nearest = block, np.clip(row, 0, rows - 1).astype(np.int64), np.clip(column, 0, columns - 1).astype(np.int64)
+    return np.asarray(surface[nearest] + slope[:, 0] * (y - row) + slope[:, 1] * (x - column))
 
 
 def register(blocks: Blocks | None) -> Registration | None:
@@ -147,16 +166,14 @@ def register(blocks: Blocks | None) -> Registration | None:
     if found is None:
         found = _vertical(blocks, before)
     shift, deviation = found
+    if (np.abs(shift[:2]) <= _CERTAIN * deviation[:2]).all():
+        shift = np.array([0.0, 0.0, _median(before)])
+    if abs(shift[2]) <= _CERTAIN * deviation[2]:
+        shift[2] = 0.0
     after = _differences(blocks, shift[:2])
-    known = np.isfinite(after)
-    return Registration(
-        shift,
-        deviation,
-        bool(np.isfinite(deviation[0])),
-        int(known.sum()),
-        before[np.isfinite(before)],
-        after[known] - shift[2],
-    )
+    known = np.isfinite(before) & np.isfinite(after)
+    is_horizontal = bool(np.isfinite(deviation[0]))
+    return Registration(shift, deviation, is_horizontal, int(known.sum()), before[known], after[known] - shift[2])
 
 
 def _differences(blocks: Blocks, shift: np.ndarray) -> np.ndarray:
@@ -164,6 +181,38 @@ def _differences(blocks: Blocks, shift: np.ndarray) -> np.ndarray:
     east, north = blocks.moves * shift / blocks.cell
     height = sampled(blocks.surface, blocks.block, blocks.x - east, blocks.y + north)
     return np.asarray(blocks.moves * (blocks.height - height))
+
+
+def _solved(blocks: Blocks, place: np.ndarray, most: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """Solve the horizontal shift from slopes (Nuth and Kaab 2011), from a place near it; also its standard deviation.
+
+    Slopes over one cell weigh the equations of slopes over two: the noise of the one is not that of the other, so noise
+    does not count as slopes of the ground. None if the equations have no solution near the place.
+    """
+    start = place
+    for _ in range(_SOLVED):
+        east, north = blocks.moves * place / blocks.cell
+        at = blocks.surface, blocks.block, blocks.x - east, blocks.y + north
+        differences = _differences(blocks, place)
+        differences -= _median(differences)
+        weights, design = (slopes(*at, reach)[:, ::-1] * (-1.0, 1.0) / blocks.cell for reach in (_NARROW, _WIDE))
+        used = (np.abs(differences) <= most) & np.isfinite(weights).all(axis=1)
+        weights, design, differences, block = weights[used], design[used], differences[used], blocks.block[used]
+        weights, design = (values - values.mean(axis=0) for values in (weights, design))
+        matrix = weights.T @ design
+        matrix = (matrix + matrix.T) / 2
+        if len(differences) < LEAST or not np.linalg.eigvalsh(matrix)[0] > 0:
+            return None
+        move = np.linalg.solve(matrix, weights.T @ differences)
+        if np.abs(place + move - start).max() > 3 * blocks.cell:
+            return None
+        place = place + move
+    scores = np.zeros((len(blocks.surface), 2))
+    np.add.at(scores, block, weights * (differences - design @ move)[:, np.newaxis])
+    count = len(np.unique(block))
+    inverse = np.linalg.inv(matrix)
+    spread = inverse @ (scores.T @ scores) @ inverse * count / max(1, count - 1)
+    return place, np.sqrt(np.diag(spread))
 
 
 def _thinned(blocks: Blocks) -> Blocks:
@@ -212,7 +261,7 @@ def _searched(blocks: Blocks) -> np.ndarray | None:
 def _with_deviation(blocks: Blocks, place: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the whole shift and its standard deviation; None if shifts further on do not fit clearly worse.
 
-    Noise has slopes too, but no place where they fit. The deviation is that of the zero of the loss's derivative.
+    Noise has slopes too, but no place where they fit.
     """
     most, step = _most(blocks, place), _PROBE * blocks.cell
     here = _clipped(blocks, place, most)
@@ -223,13 +272,11 @@ def _with_deviation(blocks: Blocks, place: np.ndarray) -> tuple[np.ndarray, np.n
             return None
     if len(np.unique(blocks.block[np.isfinite(here)])) < _LEAST_BLOCKS:
         return None
-    bends = [float(np.nanmean(before + after - 2 * here)) / step**2 for before, after in sides]
-    bend = np.array([[bends[0], (bends[2] - bends[3]) / 2], [(bends[2] - bends[3]) / 2, bends[1]]])
-    errors = [_mean_of_blocks(blocks, (after - before) / (2 * step))[1] for before, after in sides[:2]]
-    inverse = np.linalg.inv(bend)
+    if (solved := _solved(blocks, place, most)) is None:
+        return None
+    place, across = solved
     up, deviation = _vertical(blocks, _differences(blocks, place))
-    across = np.sqrt(inverse**2 @ np.square(errors) + (_BETWEEN * blocks.cell) ** 2)
-    return np.array([*place, up[2]]), np.array([*across, deviation[2]])
+    return np.array([*place, up[2]]), np.array([*np.hypot(across, _BETWEEN * blocks.cell), deviation[2]])
 
 
 def _mean_of_blocks(blocks: Blocks, values: np.ndarray) -> tuple[float, float]:

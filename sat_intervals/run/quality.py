@@ -78,7 +78,7 @@ def doubts_of(
     """Return the warnings about a pair; ``is_census``: it is matched with the penalties for clean images."""
     lines = [
         f"{path}: {100 * collars[side]['share']:.0f} % of the pixels are exactly {collars[side]['value']:.9g}, along "
-        f"its borders, and no no-data value is declared: if they are no data, give --nodata {collars[side]['value']:.9g}"
+        f"its borders, and no no-data value is declared: if it is no data, give --nodata {collars[side]['value']:.9g}"
         for side, path in zip(("left", "right"), paths, strict=True)
         if side in collars
     ]

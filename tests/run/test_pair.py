@@ -265,7 +265,7 @@ def test_match_pair__tiles_equal_one_tile_on_a_real_pair(shared_data, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
         disparity, interval = shares_that_differ(tmp_path / "whole", tmp_path / "tiles")
-    assert disparity <= 0.001
+    assert disparity <= 0.002
     assert interval <= 0.0025
 
 
