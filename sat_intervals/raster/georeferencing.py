@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from pyproj import Transformer
+from pyproj.exceptions import ProjError
 from rasterio.control import GroundControlPoint
 from rasterio.crs import CRS
 from rasterio.rpc import RPC
@@ -124,7 +125,10 @@ def footprint(place: Georeferencing, shape: tuple[int, int]) -> Corners | None:
         )
     else:
         return None
-    to_degrees = Transformer.from_crs(crs.to_wkt(), "EPSG:4326", always_xy=True)
+    try:
+        to_degrees = Transformer.from_crs(crs.to_wkt(), "EPSG:4326", always_xy=True)
+    except ProjError:  # a local CRS has no place on the ground
+        return None
     found = [to_degrees.transform(x, y) for x, y in corners]
     area = sum(x * v - u * y for (x, y), (u, v) in zip(found, found[1:] + found[:1], strict=True))
     return found if area > 0 else found[::-1]

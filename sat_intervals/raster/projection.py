@@ -12,6 +12,7 @@ from pyproj.exceptions import CRSError, ProjError
 
 from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.raster.georeferencing import Georeferencing
+from sat_intervals.raster.images import opened
 
 _GEOGRAPHIC = "EPSG:4326"
 # Degrees outside the area of a CRS that are accepted: the next UTM zone.
@@ -130,6 +131,10 @@ def undulation(geoid: Transformer | None, longitude: np.ndarray, latitude: np.nd
 def geoid_grid(path: Path) -> Transformer:
     """Return a transformer from heights above the ellipsoid to heights above a geoid (degrees, metres)."""
     check_file(path, "give a grid of geoid heights")
+    if path.suffix.lower() in (".tif", ".tiff"):
+        with opened(str(path)) as dataset:
+            if dataset.crs is None:  # PROJ would read it half a cell off
+                raise SatIntervalsError(f"{path} has no CRS: declare it, such as with gdal_edit.py -a_srs EPSG:4326")
     if "," in str(path.resolve()):
         raise SatIntervalsError(f"{path.resolve()}: PROJ reads no file with a comma in its path: rename it")
     radians = "+proj=unitconvert +xy_in=deg +xy_out=rad"

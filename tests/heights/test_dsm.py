@@ -439,6 +439,8 @@ def test_make_surface__what_it_cannot_use_gets_one_line(tmp_path):
     empty = write_points(tmp_path / "empty", [0.5], [-0.5], [np.nan])
     far = [write_points(tmp_path / f"far{x}", [x], [-0.5], [1.0]) for x in (0, 200_000)]
     (tmp_path / "geoid.txt").write_text("no grid")
+    with rasterio.open(bare := write_geoid(tmp_path / "bare.tif", 49.5), "r+") as dataset:
+        dataset.crs = None
     cases = [
         ([empty], [], "no valid pixel"),
         (far, [], "choose a coarser --resolution, or runs of one place"),
@@ -456,6 +458,7 @@ def test_make_surface__what_it_cannot_use_gets_one_line(tmp_path):
         ([far[0]], ["--output", str(tmp_path)], "is a folder: choose another name"),
         ([far[0]], ["--geoid", str(write_geoid(tmp_path / "wild.tif", -9999.0))], "has -9999 m at longitude 1.39"),
         ([far[0]], ["--geoid", str(write_geoid(tmp_path / "a,@b.tif", 9.0))], "a,@b.tif: PROJ reads no file with a co"),
+        ([far[0]], ["--geoid", str(bare)], "bare.tif has no CRS: declare it"),
         ([far[0]], ["--crs", "EPSG:4326"], "is not a map in metres"),
         ([tmp_path / "nowhere"], [], "give the folder of a finished run"),
     ]

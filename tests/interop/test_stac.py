@@ -12,7 +12,7 @@ from finished import no_bands, random_bands, write_run, write_surface
 from helpers import invoke
 from numpy.testing import assert_allclose
 
-from sat_intervals.raster import north_up, read_layers
+from sat_intervals.raster import Georeferencing, footprint, north_up, read_layers
 from sat_intervals.show.canvas import page
 
 
@@ -98,6 +98,11 @@ def test_write_item__without_georeferencing_and_valid_pixels(tmp_path, monkeypat
     assert item["properties"]["datetime"] == item["properties"]["created"] == "2026-11-21T12:00:00Z"
     assert item["assets"]["intervals"]["proj:code"] is None
     assert item["assets"]["intervals"]["bands"][0]["statistics"] == {"valid_percent": 0}
+
+
+def test_footprint__of_a_local_crs_is_none():
+    local = rasterio.crs.CRS.from_wkt('LOCAL_CS["epipolar",UNIT["metre",1]]')
+    assert footprint(Georeferencing(crs=local, transform=rasterio.Affine(0.5, 0, 0, 0, -0.5, 0)), (10, 20)) is None
 
 
 @pytest.mark.parametrize(
