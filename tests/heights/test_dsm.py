@@ -15,7 +15,7 @@ from helpers import COMMAND, invoke, wait_until
 from numpy.testing import assert_allclose, assert_array_equal
 from pyproj import Transformer
 from rasterio.shutil import copy
-from surfaces import write_geoid
+from surfaces import write_geoid, write_raster
 
 from sat_intervals import SatIntervalsError
 from sat_intervals.config import load_calibration, load_height_calibration
@@ -439,8 +439,7 @@ def test_make_surface__what_it_cannot_use_gets_one_line(tmp_path):
     empty = write_points(tmp_path / "empty", [0.5], [-0.5], [np.nan])
     far = [write_points(tmp_path / f"far{x}", [x], [-0.5], [1.0]) for x in (0, 200_000)]
     (tmp_path / "geoid.txt").write_text("no grid")
-    with rasterio.open(bare := write_geoid(tmp_path / "bare.tif", 49.5), "r+") as dataset:
-        dataset.crs = None
+    bare = write_raster(tmp_path / "bare.tif", np.full((1, 4, 4), 49.5), rasterio.Affine(1, 0, 0, 0, -1, 46), None)
     cases = [
         ([empty], [], "no valid pixel"),
         (far, [], "choose a coarser --resolution, or runs of one place"),
