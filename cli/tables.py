@@ -47,7 +47,7 @@ def show_groups(rows: Sequence[Row], title: str) -> None:
     if any(row.scenes is None for row in rows):
         click.echo(
             "paper: Malinowski et al. 2024; reference: their implementation in Pandora, measured for this project; it "
-            "cross-checks as with --accurate"
+            "cross-checks as with cross_check.method accurate"
         )
 
 
@@ -93,7 +93,7 @@ def show_scene(scene: SceneMetrics) -> None:
     bad = [_figure(report[name]) for name in ("bad1", "bad3")]
     click.echo(f"disparity wrong by more than 1 px: {bad[0]}, by more than 3 px: {bad[1]}")
     if report["locking"] is not None:
-        click.echo(f"locking to whole pixels, share of the variance of errors up to 1 px: {_figure(report['locking'])}")
+        click.echo(f"locking to whole pixels (0 none, 1 whole pixels only): {_figure(report['locking'])}")
     if report["tolerance"]:
         click.echo(f"truth up to {report['tolerance']:g} px outside an interval counts as inside")
     if report["bias"] is not None:

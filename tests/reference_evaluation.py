@@ -65,8 +65,8 @@ def figures(scene, rules, judged, bias):
     }
     over = [1 - worst[p] / width[p] for p in judged if low[p] and width[p] > 0]
     report["low"]["relative_overestimation"] = middle(over)
-    small = {p: float(scene.disparity[p]) - truth[p] for p in judged if error[p] <= 1}
-    report["locking"] = locking({p: truth[p] for p in small}, small)
+    near = [p for p in judged if error[p] <= 1]
+    report["locking"] = locking({p: truth[p] for p in near}, {p: scene.disparity[p] for p in near})
     report["deciles"] = deciles(scene.confidence, judged, inside, width)
     return report
 
@@ -82,15 +82,12 @@ def area_errors(low, error, depth):
     return worst
 
 
-def locking(truth, error):
-    """One less the variance of errors within sixteenths of the truth's fraction, over all of it."""
-    groups = {}
-    for p, value in error.items():
-        groups.setdefault(int(16 * (truth[p] % 1)) % 16, []).append(value)
-    if len(groups) < 2 or np.var(list(error.values())) == 0:
+def locking(truth, disparity):
+    """The mean cosine of the fractions of disparities, less that of truths."""
+    if all(value % 1 == 0 for value in truth.values()):
         return None
-    within = sum(len(group) * np.var(group) for group in groups.values())
-    return 1 - within / (len(error) * np.var(list(error.values())))
+    means = [mean(np.cos(2 * np.pi * float(value)) for value in values.values()) for values in (disparity, truth)]
+    return means[0] - means[1]
 
 
 def deciles(confidence, judged, inside, width):

@@ -51,9 +51,9 @@ def evaluate_run(
     Figures over valid pixels: for ``all``, ``high`` and ``low`` confidence ``count``, ``accuracy``, ``relative_size``,
     ``mean_width``, ``median_width`` and ``interval_score`` (pixels), for ``low`` also ``relative_overestimation``;
     ``bad1`` and ``bad3``, the shares of disparities wrong by more than 1 and 3 px; ``truth_outside_range``, the share
-    of truths outside the search range; ``locking``, the share of the variance of errors up to 1 px that the fraction of
-    the true disparity explains; ``deciles`` of confidence with their coverage. ``with_rejected`` contains the
-    same over all pixels with an interval, None unless the run kept rejected pixels. ``bias`` is the bias removed
+    of truths outside the search range; ``locking``, how much more often disparities wrong by at most 1 px are near
+    whole pixels than truths, 0 alike and 1 whole pixels only; ``deciles`` of confidence with their coverage.
+    ``with_rejected`` contains the same over all pixels with an interval, None unless the run kept rejected pixels. ``bias`` is the bias removed
     (pixels), None without ``remove_bias``. ``truth_is_whole`` is true if all truths of valid pixels are whole numbers.
     ``nominal`` is the coverage or the alpha of the run, as ``nominal_is`` says, for which ``interval_score`` judges.
     ``cost`` and ``tolerance`` are the settings used.

@@ -13,7 +13,6 @@ from sat_intervals.products import Bands
 
 _WIDTH, _RATIO, _CONFIDENCE = 100, 1000, 1000  # steps a unit
 _LARGEST_RATIO = 100
-_FRACTIONS, _EXACT = 16, 1e-9  # of a pixel; smallest variance, in squares of the mean
 
 
 @dataclass(frozen=True)
@@ -98,25 +97,21 @@ class _Deciles:
 
 
 class _Locking:
-    """Share of the variance of small errors that the fraction of the true disparity explains."""
+    """How much more often disparities are near whole pixels than truths: 0 alike, 1 whole pixels only."""
 
     def __init__(self) -> None:
-        self._count, self._sum, self._squares = np.zeros((3, _FRACTIONS))
+        self._count, self._disparity, self._truth = 0, 0.0, 0.0
 
-    def add(self, error: np.ndarray, truth: np.ndarray) -> None:
-        near = np.abs(error) <= 1
-        place = (truth[near] % 1 * _FRACTIONS).astype(np.int64) % _FRACTIONS
-        for total, weights in ((self._count, None), (self._sum, error[near]), (self._squares, error[near] ** 2)):
-            total += np.bincount(place, weights, _FRACTIONS)
+    def add(self, disparity: np.ndarray, truth: np.ndarray) -> None:
+        near = np.abs(disparity - truth) <= 1
+        self._count += int(near.sum())
+        self._disparity += float(np.cos(2 * np.pi * disparity[near]).sum())
+        self._truth += float(np.cos(2 * np.pi * truth[near]).sum())
 
     def report(self) -> float | None:
-        """Return the share; None if all truths have one fraction."""
-        known = self._count > 0
-        if known.sum() < 2:
-            return None
-        mean = self._sum.sum() ** 2 / self._count.sum()
-        between, all_of = (self._sum[known] ** 2 / self._count[known]).sum() - mean, self._squares.sum() - mean
-        return share(max(between, 0.0), all_of) if all_of > _EXACT * mean else None
+        """Return the difference of the mean cosines of the fractions; None if all truths are whole."""
+        known = self._count and self._truth < self._count
+        return (self._disparity - self._truth) / self._count if known else None
 
 
 class Metrics:
@@ -147,7 +142,7 @@ class Metrics:
         self._ratios.add(area_error[wide] / width[wide])
         self._deciles.add(confidence, missed == 0, width)
         error = np.abs(disparity - truth)
-        self._locking.add(disparity - truth, truth)
+        self._locking.add(disparity, truth)
         self._wrong["bad1"] += int((error > 1).sum())
         self._wrong["bad3"] += int((error > 3).sum())
         self._wrong["truth_outside_range"] += int(((truth < criteria.minimum) | (truth > criteria.maximum)).sum())

@@ -272,7 +272,11 @@ def _with_deviation(blocks: Blocks, place: np.ndarray) -> tuple[np.ndarray, np.n
             return None
     if len(np.unique(blocks.block[np.isfinite(here)])) < _LEAST_BLOCKS:
         return None
-    if (solved := _solved(blocks, place, most)) is None:
+    spreads = [_median(_clipped(blocks, start, np.inf)) for start in (np.zeros(2), place)]
+    # edges of surfaces grow to one side: they move the search, but not the median
+    start = np.zeros(2) if spreads[0] < spreads[1] else place
+    solved = _solved(blocks, start, _CLIP * _NORMAL * min(spreads)) or _solved(blocks, start, most)
+    if solved is None:
         return None
     place, across = solved
     up, deviation = _vertical(blocks, _differences(blocks, place))

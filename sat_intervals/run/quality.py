@@ -44,9 +44,10 @@ def _collar(image: Image, region: Window) -> dict[str, float] | None:
     if not is_plain(image) or inside.width <= 0:
         return None
     rows = np.unique(np.linspace(inside.row, inside.row_stop - 1, _ROWS).astype(int))
-    pixels = np.concatenate([read_window(image, Window(int(row), inside.column, 1, inside.width))[0] for row in rows])
-    smallest = pixels.min()
-    has = pixels == smallest
+    lines = (read_window(image, Window(int(row), inside.column, 1, inside.width)) for row in rows)
+    pixels, state = (np.concatenate(parts) for parts in zip(*lines, strict=True))
+    smallest = pixels.min(where=state == 0, initial=np.inf)
+    has = (pixels == smallest) & (state == 0)
     runs = np.logical_and.accumulate(has, 1) | np.logical_and.accumulate(has[:, ::-1], 1)[:, ::-1]
     return {"value": float(smallest), "share": round(float(runs.mean()), 4)} if runs.mean() > COLLAR else None
 

@@ -82,9 +82,9 @@ def test_bounds_of_both__worked_example():
     config = load_config({"preset": "satellite", "disparity": {"minimum": 0, "maximum": 20}})
     fits = Refined(np.float32([5, 5, 5, 19]), np.float32([0.1, np.nan, 0.1, 0.1]))
     lower, upper = bounds_of_both(fits, np.float32([4.5, 4.5, 5.2, 18]), np.float32([5.7, 5.7, 6.2, 20]), 2.0, config)
-    # 2 (.2 + .1) (.3 + .5) = .48; without a fit 2 (.2 + .5) (.3 + .5) = 1.12; a cut beyond the disparity leaves .3
-    assert_allclose(lower, [5 - 0.48, 5 - 1.12, 5 - 0.18, 19 - 0.78], rtol=1e-6)
-    assert_allclose(upper, [5 + 0.6, 5 + 1.4, 5 + 0.9, 19 + 0.78], rtol=1e-6)
+    # 2 (.2 + .1) (.3 + .5) = .48; without a fit 2 (.2 + 1) (.3 + .5) = 1.92; a cut beyond the disparity leaves .3
+    assert_allclose(lower, [5 - 0.48, 5 - 1.92, 5 - 0.18, 19 - 0.78], rtol=1e-6)
+    assert_allclose(upper, [5 + 0.6, 5 + 2.4, 5 + 0.9, 19 + 0.78], rtol=1e-6)
     wide = bounds_of_both(fits, np.float32([4.5] * 4), np.float32([5.7] * 4), 1000.0, config)
     assert_array_equal(wide, [[0] * 4, [20] * 4])
 

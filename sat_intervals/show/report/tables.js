@@ -202,7 +202,7 @@ function drawTiles(wide, worst) {
 
 function showRun() {
   const place = find("run");
-  const words = (value) => (typeof value === "object" ? JSON.stringify(value) : String(value));
+  const words = (value) => (typeof value !== "object" ? String(value) : value.levels ? value.name : JSON.stringify(value)); // a calibration
   const given = (values) => Object.entries(values).filter(([, value]) => value !== null && value.length !== 0);
   const section = ([name, values]) => (values === null || typeof values !== "object"
     ? [[name, values ?? "off", ""]]
