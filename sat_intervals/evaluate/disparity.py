@@ -53,10 +53,10 @@ def evaluate_run(
     ``bad1`` and ``bad3``, the shares of disparities wrong by more than 1 and 3 px; ``truth_outside_range``, the share
     of truths outside the search range; ``locking``, how much more often disparities wrong by at most 1 px are near
     whole pixels than truths, 0 alike and 1 whole pixels only; ``deciles`` of confidence with their coverage.
-    ``with_rejected`` contains the same over all pixels with an interval, None unless the run kept rejected pixels. ``bias`` is the bias removed
-    (pixels), None without ``remove_bias``. ``truth_is_whole`` is true if all truths of valid pixels are whole numbers.
-    ``nominal`` is the coverage or the alpha of the run, as ``nominal_is`` says, for which ``interval_score`` judges.
-    ``cost`` and ``tolerance`` are the settings used.
+    ``with_rejected`` contains the same over all pixels with an interval, None unless the run kept rejected pixels.
+    ``bias`` is the bias removed (pixels), None without ``remove_bias``. ``truth_is_whole`` is true if all truths of
+    valid pixels are whole numbers. ``nominal`` is the coverage or the alpha of the run, as ``nominal_is`` says, for
+    which ``interval_score`` judges. ``cost`` and ``tolerance`` are the settings used.
 
     Raises
     ------
