@@ -802,7 +802,7 @@ def test_match__takes_a_preset_and_what_is_given_beside_it(folder, tmp_path):
     assert (settings["cost"]["window"], settings["sgm"]["p1"], settings["sgm"]["p2"]) == (5, 8, 99)
     assert settings["tiles"]["overlap"] == 40
     del settings["preset"]  # known by what it set
-    config = {name: settings[name] for name in ("disparity", "cost", "sgm", "interval", "tiles")}
+    config = {name: settings[name] for name in ("disparity", "cost", "sgm", "interval", "refinement", "tiles")}
     (tmp_path / "spelt.yaml").write_text(json.dumps(config))
     command(*matching(folder, tmp_path / "spelt", "--window", 60, 80, 70, 90, config=tmp_path / "spelt.yaml"))
     assert hashes(tmp_path / "spelt") == hashes(tmp_path / "out")
