@@ -555,6 +555,15 @@ def match_arrays(left, right, left_state, right_state, config):
     return SimpleNamespace(disparity=disparity, lower=lower, upper=upper, confidence=confidence, validity=flags)
 
 
+def waves(row, column, steepness, deviation, seed=0):
+    """Grey values at any place: 300 waves of random direction, with frequencies of this deviation, about 500."""
+    random = np.random.default_rng(seed)
+    down, across = np.clip(random.normal(0, steepness, (2, 300)), -2.4, 2.4)
+    phase = random.uniform(0, 2 * np.pi, 300)
+    total = sum(np.cos(i * row + j * column + start) for i, j, start in zip(down, across, phase, strict=True))
+    return 500 + deviation * np.sqrt(2 / 300) * total
+
+
 # ---- Least squares -----------------------------------------------------------------------------------------
 def cubic(t):
     """Keys' kernel with a = -1/2."""

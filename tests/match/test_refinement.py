@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+import reference
 from numpy.testing import assert_allclose, assert_array_equal
-from scipy.ndimage import gaussian_filter
 
 from sat_intervals import load_config, match_arrays
 from sat_intervals.match.refinement import Refined, bounds_of_both, pixel_windows, pixels_of, refined
@@ -16,14 +16,9 @@ SEARCH = {"minimum": -4, "maximum": 12}
 
 def pair(rows=90, columns=120, shift=3.3):
     """Textured images; the right one is moved by a fraction of a pixel, and noisy."""
-    random = np.random.default_rng(0)
-    ground = gaussian_filter(random.normal(0, 1, (rows, 8 * (columns + 20))), (1, 8)) * 3000 + 500
-    left = ground[:, 0 : 8 * columns : 8]
-    start = -round(8 * shift) % 8
-    whole = int(np.ceil(shift))
-    right = ground[:, start : start + 8 * columns : 8]
-    right = np.concatenate([random.normal(500, 100, (rows, whole)), right[:, : columns - whole]], axis=1)
-    return left, right + random.normal(0, 3, right.shape)
+    row, column = np.mgrid[0.0:rows, 0.0:columns]
+    left, right = (reference.waves(row, column - moved, 0.6, 150) for moved in (0.0, shift))
+    return left, right + np.random.default_rng(0).normal(0, 2, right.shape)
 
 
 @pytest.fixture(scope="module")
