@@ -68,7 +68,8 @@ pictures: $(VENV)/.has-dsm,plot
 	mkdir -p .github/pictures
 	$(BIN)/python docs/pictures/wavefronts.py demo-out/wavefronts.png
 	$(BIN)/python docs/pictures/staircase.py demo-out/staircase.png
-	for name in overview profile dsm wavefronts staircase; do $(BIN)/python -c 'import sys; from PIL import Image; Image.open(sys.argv[1]).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(sys.argv[2], optimize=True)' demo-out/$$name.png .github/pictures/$$name.png; done
+	$(BIN)/python docs/pictures/rows.py demo-out/rows.png
+	for name in overview profile dsm wavefronts staircase rows; do $(BIN)/python -c 'import sys; from PIL import Image; Image.open(sys.argv[1]).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(sys.argv[2], optimize=True)' demo-out/$$name.png .github/pictures/$$name.png; done
 
 # The documentation site, in site/; a warning is an error. Pictures of the gallery are made by running the commands.
 docs: $(VENV)/.has-docs,dsm,plot

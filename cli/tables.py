@@ -164,10 +164,6 @@ def _nominal_line(report: dict[str, Any]) -> str:
     return f"{_NOMINAL[report['nominal_is']]}: {report['nominal']:g}; the interval score judges for it, less is better"
 
 
-def _deviations(found: dict[str, Any]) -> str:
-    return ", ".join(f"{value:.2g} m" for value in found["deviation"])
-
-
 def registration_lines(found: dict[str, Any] | None) -> list[str]:
     """Return lines for the user about a registration: the shift, and figures before and after it."""
     if found is None:
@@ -178,7 +174,8 @@ def registration_lines(found: dict[str, Any] | None) -> list[str]:
     )
     lines = [f"reference moved: easting {east}, northing {north}, height {up}"]
     if not any(found["shift"]) and found["is_horizontal"]:
-        lines = [f"reference not moved: its shift is less than two standard deviations, {_deviations(found)}"]
+        deviations = ", ".join(f"{value:.2g} m" for value in found["deviation"])
+        lines = [f"reference not moved: its shift is less than two standard deviations, {deviations}"]
     if not found["is_horizontal"]:
         lines = [f"reference moved: height {up}; easting and northing cannot be determined here, as on flat ground"]
     for when in ("before", "after"):

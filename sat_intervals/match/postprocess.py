@@ -16,7 +16,7 @@ from sat_intervals.kernels.disparity import cross_check, median
 from sat_intervals.kernels.intervals import regularize
 from sat_intervals.kernels.matching import Raw, RightView
 from sat_intervals.match.histogram import quantile
-from sat_intervals.match.refinement import HALO, Refined, bounds_of_both, pixels_of, refined
+from sat_intervals.match.refinement import HALO, Refined, bounds_of_both, refined
 from sat_intervals.products import (
     BOUND_STEPS,
     INVALID,
@@ -27,7 +27,6 @@ from sat_intervals.products import (
     REGULARIZED,
     Bands,
 )
-from sat_intervals.tiling import Views
 
 # Steps per pixel in which sub-pixel bounds are regularised.
 _STEPS = 8
@@ -64,11 +63,6 @@ class RawRows(NamedTuple):
     def of(cls, raw: Raw, right: RightView) -> "RawRows":
         """Make the rows of a pair that was matched as one tile."""
         return cls(**{name: getattr(raw, name) for name in raw._fields if name != "cost"}, right_winner=right.winner)
-
-    def with_pixels(self, views: Views) -> "RawRows":
-        """Add the pixels of both images."""
-        left, right = pixels_of(views)
-        return self._replace(left=left, right=right)
 
 
 class Filtered(NamedTuple):

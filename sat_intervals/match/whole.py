@@ -8,7 +8,7 @@ from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.patch import Frame, Patch, match_patch, patch_windows
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_rows
-from sat_intervals.match.refinement import pixel_windows
+from sat_intervals.match.refinement import pixel_windows, pixels_of
 from sat_intervals.products import NO_DATA, NO_DISPARITY, Bands
 from sat_intervals.tiling import View, Views, Window
 
@@ -42,8 +42,9 @@ def whole_rows(patch: Patch, views: Views, window: Window, config: Config) -> Ra
     """Return the rows of a pair that was matched as one tile, with the pixels that the settings need."""
     rows = RawRows.of(patch.raw, patch.right)
     if config.fits:
-        left, right = map(cut, views, pixel_windows(window, config))
-        rows = rows.with_pixels((left, right))
+        windows = pixel_windows(window, config)
+        left, right = pixels_of((cut(views[0], windows[0]), cut(views[1], windows[1])))
+        rows = rows._replace(left=left, right=right)
     return rows
 
 
