@@ -34,6 +34,9 @@ from sat_intervals.cli.surface import surface
 from sat_intervals.cli.triangulate import triangulate
 
 FAILED, USER_ERROR = 1, 2
+# Packages of extras.
+_EXTRAS = {"matplotlib": "plot", "shareloc": "dsm", "scipy": "dsm", "onnxruntime": "mccnn", "dask_jobqueue": "cluster"}
+_EXTRAS |= dict.fromkeys(("laspy", "pyogrio", "shapely"), "reference")
 _ITEM = "\n  "
 RESUMED = ("match", "demo", "batch", "surface")
 STEPS: dict[str, tuple[click.Command, ...]] = {
@@ -97,6 +100,8 @@ def _explained(error: Exception) -> tuple[int, str]:
         return FAILED, f"not enough memory: choose a smaller --tile-size or fewer --workers ({error})"
     if isinstance(error, OSError) and error.strerror:
         return FAILED, f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    if isinstance(error, ModuleNotFoundError) and (extra := _EXTRAS.get((error.name or "").split(".")[0])):
+        return USER_ERROR, f"{error.name} is not installed: pip install 'sat-intervals[{extra}]'"
     line = " ".join(str(error).split())
     return FAILED, f"{type(error).__name__}: {line} (this should not happen; --debug shows where)"
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import click
 
+from sat_intervals.cli.logs import warn
 from sat_intervals.cli.matching import RunArguments, SettingsArguments, run_options, settings_options
 from sat_intervals.cli.options import FILE, json_option, say_json
 from sat_intervals.cli.triangulate import geometry_warnings
@@ -48,8 +49,7 @@ def batch(pairs: Path, out: Path, as_json: bool, settings: SettingsArguments, ru
     of_surfaces = [
         line for end in report.values() if "surface" in end for line in geometry_warnings(end["surface"]["geometry"])
     ]
-    for line in of_surfaces:
-        click.echo(line, err=True)
+    warn(of_surfaces)
     done = ("done", "done before")
     failed = {name: end.get("error", end["state"]) for name, end in report.items() if end["state"] not in done}
     if failed:

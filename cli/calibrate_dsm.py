@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import click
 
 from sat_intervals.cli.calibration_files import check_output, write
+from sat_intervals.cli.logs import warn
 from sat_intervals.cli.options import Surface, say_json
 
 if TYPE_CHECKING:
@@ -62,8 +63,7 @@ def _show(calibration: "HeightCalibration") -> None:
     if found["shift"] is not None:
         east, north, up = found["shift"]
         click.echo(f"reference moved: easting {east:+.2f} m, northing {north:+.2f} m, height {up:+.2f} m")
-    for line in found["warnings"]:
-        click.echo(line)
+    warn(found["warnings"])
     keys = {
         "coverage": "coverage",
         "lowest": "lowest",

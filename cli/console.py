@@ -10,6 +10,7 @@ from rich.console import Console as Terminal
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.table import Table
 
+from sat_intervals.cli.logs import warn
 from sat_intervals.cli.options import PICTURES
 
 STAGES = {
@@ -33,6 +34,9 @@ STAGES = {
     "files": "writing files",
 }
 
+
+# Causes of invalid pixels whose flags do not say enough.
+_CAUSES = {"left_window": "no data or border", "no_candidate": "nothing to match within the range"}
 
 # Files that other commands write to the folder of a run.
 _MADE_FROM_RUNS = ("points.tif", "dsm.tif", "report.html", "project.qgz", "stac.json", *(f"{n}.png" for n in PICTURES))
@@ -60,7 +64,7 @@ class Console:
         )
         self._task: tuple[str, TaskID] | None = None
         self._began: dict[str, tuple[float, int]] = {}
-        self._printed: dict[str, int] = {}
+        self._printed: set[str] = set()
 
     def __enter__(self) -> Self:
         self._bar.__enter__()
@@ -78,7 +82,7 @@ class Console:
         rate = (done - before) / elapsed if elapsed > 0 else 0.0
         state = _state(done, total, rate) if total > 1 else ""
         if self._bar.disable:
-            self._print_line(stage, done, total, state)
+            self._print_line(stage, total)
         else:
             self._draw(stage, done, total, state)
 
@@ -90,20 +94,18 @@ class Console:
             self._task = stage, self._bar.add_task(STAGES[stage], state="")
         self._bar.update(self._task[1], completed=done, total=total if total > 1 else None, state=state)
 
-    def _print_line(self, stage: str, done: int, total: int, state: str) -> None:
-        """Print a line at the start of a stage and at every tenth of it."""
-        tenth = 10 * done // max(total, 1)
-        if self._printed.get(stage) == tenth or (stage in self._printed and not state):
-            return
-        self._printed[stage] = tenth
-        self._terminal.print(f"{STAGES[stage]}: {state}" if state else STAGES[stage], soft_wrap=True)
+    def _print_line(self, stage: str, total: int) -> None:
+        """Print a line at the start of a stage."""
+        if stage not in self._printed:
+            self._printed.add(stage)
+            self._terminal.print(f"{STAGES[stage]}: {total}" if total > 1 else STAGES[stage], soft_wrap=True)
 
     def say(self, text: str) -> None:
         """Print a line."""
         self._terminal.print(text, soft_wrap=True)
 
     def summary(self, report: dict[str, Any], out: Path, then: str | None = None) -> None:
-        """Print the table at the end of a run, its files, and the next command to try, if any."""
+        """Print the table at the end of a run, its verdict, its warnings, its files, and the next command, if any."""
         counts = report["counts"]
         table = Table(show_header=False, box=None, pad_edge=False)
         table.add_column(style="bold")
@@ -116,7 +118,7 @@ class Console:
         table.add_row("valid pixels", _share(counts["valid"], pixels))
         for flag, count in counts["causes"].items():
             if count:
-                table.add_row(f"  {flag.replace('_', ' ')}", _share(count, pixels))
+                table.add_row(f"  {_CAUSES.get(flag, flag.replace('_', ' '))}", _share(count, pixels))
         width = counts["median_interval_width"]
         table.add_row("median interval width", "none" if width is None else f"{width:.2f} px")
         table.add_row("low confidence, of valid pixels", _share(counts["low_confidence"], counts["valid"]))
@@ -126,6 +128,8 @@ class Console:
             table.add_row("rows of the right image moved", moved)
         table.add_row("time", f"{report['seconds']['total']:.1f} s")
         self._terminal.print(table)
+        self.say(report["verdict"])
+        warn(report["warnings"])
         for name in ("intervals.tif", "validity.tif", "run.json"):
             self._terminal.print(str(out / name), soft_wrap=True)
         if old := [name for name in _MADE_FROM_RUNS if _is_older(out / name, out / "run.json")]:
@@ -137,7 +141,7 @@ class Console:
         """Print the table at the end of a batch: the state of each pair, and its surface if any pair has one."""
         surfaces = {name: end["surface"] for name, end in report.items() if "surface" in end}
         of_surfaces = ("filled", "median half width") if surfaces else ()
-        table = Table("pair", "state", "valid", "median width", *of_surfaces, box=None, pad_edge=False)
+        table = Table("pair", "state", "valid", "median width", *of_surfaces, "warnings", box=None, pad_edge=False)
         for name, end in report.items():
             counts = end.get("counts")
             width = counts and counts["median_interval_width"]
@@ -146,8 +150,11 @@ class Console:
             if name in surfaces:
                 half = surfaces[name]["median_half_width"]
                 row += [f"{100 * surfaces[name]['filled']:.1f} %", f"+-{half:.2f} m" if half is not None else ""]
-            table.add_row(*row)
+            elif surfaces:
+                row += ["", ""]
+            table.add_row(*row, str(len(end.get("warnings", ()))) if counts else "")
         self._terminal.print(table)
+        warn(line for end in report.values() for line in end.get("warnings", ()))
 
 
 def _share(part: int, whole: int) -> str:

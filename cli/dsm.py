@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from sat_intervals.cli.logs import warn
 from sat_intervals.cli.options import (
     FILE,
     Command,
@@ -108,14 +109,17 @@ def say_surface(console: "Console", report: dict[str, Any]) -> None:
     for name, what in (
         ("outliers", "points left out as outliers"),
         ("open", "points left out, with intervals open at an end of the search range"),
+        ("border", "points left out, beside missing data of the right image and without confidence"),
         ("poor_cells", "cells left out for their width or confidence"),
     ):
         if report[name]:
             console.say(f"{report[name]} {what}")
     if report["disagreeing"] is not None:
         console.say(f"where runs overlap, {100 * report['disagreeing']:.1f} % of the cells disagree")
-    for out in report["without_intervals"]:
-        click.echo(f"{out} was matched without intervals: cells without another run have no height bounds", err=True)
+    warn(
+        f"{out} was matched without intervals: cells without another run have no height bounds"
+        for out in report["without_intervals"]
+    )
 
 
 @click.command(short_help="Make a surface model with height intervals from one or several runs.")

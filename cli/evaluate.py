@@ -8,10 +8,15 @@ import click
 
 from sat_intervals.cli.evaluate_dsm import Details, details_options, evaluate_heights
 from sat_intervals.cli.judging import Judging, Source, find_sources, judging_options, say_scenes
+from sat_intervals.cli.logs import warn
 from sat_intervals.cli.options import FILE, Surface, surface_options
 
 if TYPE_CHECKING:
     from sat_intervals.config import Config
+    from sat_intervals.evaluate.paper import SceneMetrics
+
+# Pixels of median error above which the truth may be biased.
+_BIAS = 0.25
 
 
 @click.command(short_help="Evaluate intervals against a known truth.")
@@ -39,11 +44,11 @@ def evaluate(
 ) -> None:
     """Evaluate the intervals of the runs in the folders OUT against the truth of their left images.
 
-    Prints figures over valid pixels: accuracy (share of intervals that contain the truth), relative size (median width
-    / width of the search range) and, for low confidence, relative overestimation (median of 1 - largest error of the
-    area / width). If a run kept rejected pixels, also prints figures over all pixels with an interval. For several OUT,
-    prints means over the scenes of each group (the paper's table 1), and the coverage of each scene; `group` is read
-    from meta.json beside the left image.
+    Prints figures over valid pixels: coverage (share of intervals that contain the truth), widths and interval score;
+    --json also has the paper's relative size (median width / width of the search range) and relative overestimation
+    (median of 1 - largest error of the area / width). If a run kept rejected pixels, also prints figures over all
+    pixels with an interval. For several OUT, prints means over the scenes of each group (the paper's table 1), and the
+    coverage of each scene; `group` is read from meta.json beside the left image.
 
     Without --truth, the truth is truth.tif beside the left image. OUT may also be a pair, which is matched first: a
     folder with left.tif, right.tif, truth.tif and meta.json (`disparity`: [minimum, maximum], `group`), or a CSV file
@@ -72,14 +77,24 @@ def evaluate(
         report = _evaluated(source, config, tolerance=judging.tolerance, remove_bias=remove_bias)
         scenes.append(SceneMetrics(source.name, group or _group(source), report))
     names = [scene.name for scene in scenes if scene.report["truth_is_whole"]]
-    if names and not judging.tolerance and not judging.quiet:  # such a truth may be wrong by half a pixel
-        click.echo(f"warning: the truth of {', '.join(names)} has whole pixels only: try --tolerance 0.5", err=True)
+    if not judging.quiet:
+        warn(_biased(scene) for scene in scenes if abs(scene.report["median_error"] or 0.0) > _BIAS)
+        if names and not judging.tolerance:  # such a truth may be wrong by half a pixel
+            warn([f"the truth of {', '.join(names)} has whole pixels only: try --tolerance 0.5"])
     if judging.as_json:
         say_scenes(scenes)
     elif len(scenes) == 1:
         show_scene(scenes[0])
     else:
         show_scenes(scenes)
+
+
+def _biased(scene: "SceneMetrics") -> str:
+    error = scene.report["median_error"]
+    return (
+        f"{scene.name}: the median of disparity - truth is {error:+.2f} px: if the truth is only known up to a "
+        "constant, such as one of registered heights, try --remove-bias"
+    )
 
 
 def _configs(sources: list[Source], judging: Judging) -> "list[Config | None]":
@@ -107,7 +122,7 @@ def _evaluated(source: Source, config: "Config | None", **how: Any) -> dict[str,
     from sat_intervals.run.pair import match_pair
 
     with TemporaryDirectory(prefix="sat-intervals-") as out:
-        match_pair(source.pair.left, source.pair.right, out, config)
+        warn(match_pair(source.pair.left, source.pair.right, out, config)["warnings"])
         return evaluate_run(out, source.truth or source.pair.truth, source.mask, **how)
 
 

@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import IO
@@ -12,6 +12,7 @@ import click
 from sat_intervals.cli.signals import Ended
 
 _LOG = logging.getLogger(__name__)
+REPORT = "sat_intervals.report"  # logger of the warnings of a run, which `Console.summary` prints
 _LINES = logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s")
 
 
@@ -20,9 +21,15 @@ def printable(text: str) -> str:
     return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
 
 
+def warn(lines: Iterable[str]) -> None:
+    """Print warnings on stderr."""
+    for line in lines:
+        click.echo(f"warning: {printable(line)}", err=True)
+
+
 class _Warnings(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
-        return f"sat-intervals: {printable(record.getMessage())}"
+        return f"warning: {printable(record.getMessage())}"
 
 
 class _Handler(logging.Handler):
@@ -59,6 +66,7 @@ def logged(debug: bool, log_file: Path | None) -> Iterator[None]:
         else:
             warnings = _Handler(_Warnings())
             warnings.setLevel(logging.WARNING)
+            warnings.addFilter(lambda record: record.name != REPORT)
             stack.enter_context(_added(warnings, ours))
         # dask's logger gets a handler of its own and does not propagate, unless the root logger already has handlers
         dasks = logging.getLogger("distributed")

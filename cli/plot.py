@@ -1,6 +1,7 @@
 """``sat-intervals plot``: draw pictures of a finished run."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,7 @@ def plot(
     \b
     OUT/overview.png   always: left image, disparity, width, confidence, validity
     OUT/errors.png     with a truth and intervals: pixels whose interval misses it
-    OUT/coverage.png   likewise: nominal and measured coverage, width
+    OUT/coverage.png   with --beside: nominal and measured coverage, width
     OUT/range.png      for a found or local search range: matches, cells
     OUT/profile.png    with --row: interval, disparity and truth along a row
     OUT/curve.png      with --pixel: cost curve of a pixel and its interval
@@ -67,11 +68,11 @@ def plot(
     drawings: dict[str, Callable[[Path], None]] = {"overview": lambda target: draw_overview(results, target, dpi)}
     if is_judged:
         drawings["errors"] = lambda target: draw_errors(results, target, dpi)
+    if beside:
         drawings["coverage"] = lambda target: draw_coverage([out, *beside], target, dpi, truth=truth, **judging)
-    if has_range(results):
-        drawings["range"] = lambda target: draw_range(results, target, dpi)
-    if has_rows(results):
-        drawings["rows"] = lambda target: draw_rows(results, target, dpi)
+    for name, has, drawn in (("range", has_range, draw_range), ("rows", has_rows, draw_rows)):
+        if has(results):
+            drawings[name] = partial(drawn, results, dpi=dpi)
     if row is not None:
         results.check_part(row, columns)
         drawings["profile"] = lambda target: draw_profile(results, target, row, columns, dpi)

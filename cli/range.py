@@ -5,6 +5,7 @@ from typing import Any
 
 import click
 
+from sat_intervals.cli.logs import warn
 from sat_intervals.cli.matching import PairArguments, pair_options
 from sat_intervals.cli.options import FILE, json_option, log_options, overwrite_option, quiet_option, say_json
 
@@ -30,7 +31,7 @@ def search_range(pair: PairArguments, output: Path | None, overwrite: bool, as_j
     from sat_intervals.raster.identity import check_not_replaced
     from sat_intervals.raster.publishing import check_free
     from sat_intervals.run.local_ranges import write_ranges
-    from sat_intervals.run.quality import doubts_of, rows_left
+    from sat_intervals.run.quality import collar_lines, rows_left
     from sat_intervals.run.search_range import finder_here
     from sat_intervals.tiling import Window
 
@@ -51,8 +52,7 @@ def search_range(pair: PairArguments, output: Path | None, overwrite: bool, as_j
         return
     for name, value in [*_rows(found), *_survey(survey)]:
         click.echo(f"{name:<36}{value}")
-    for line in [*doubts_of(found.collars, survey, pair.images), *rows_left(survey, "auto", pair.images[1])]:
-        click.echo(line)
+    warn([*collar_lines(found.collars, pair.images), *rows_left(survey, "auto", pair.images[1])])
 
 
 def _rows(found: Any) -> list[tuple[str, str]]:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from sat_intervals.cli.logs import warn
 from sat_intervals.cli.options import (
     FILE,
     SensorFiles,
@@ -99,12 +100,9 @@ def _say_fit(console: "Console", report: dict[str, Any]) -> None:
             console.say(line)
         up = report["registration"]["shift"][2]
         if abs(up) > _SUSPECT_HEIGHT:
-            click.echo(
-                f"warning: the reference was moved by {up:.1f} m in height: check what its heights refer to", err=True
-            )
+            warn([f"the reference was moved by {up:.1f} m in height: check what its heights refer to"])
     misfit = report["row_misfit"]
     if misfit:
         console.say(f"row misfit of models and grids: {misfit[0]:.2g} px in the median, {misfit[1]:.2g} px at most")
         if misfit[0] > _SUSPECT_ROWS:
-            line = f"the rows of the two images differ by {misfit[0]:.2g} px: check models and grids"
-            click.echo(f"warning: {line}", err=True)
+            warn([f"the rows of the two images differ by {misfit[0]:.2g} px: check models and grids"])

@@ -82,10 +82,7 @@ def show_scene(scene: SceneMetrics) -> None:
     rows = _areas(report, "")
     if report["with_rejected"]:
         rows += _areas(report["with_rejected"], ", with rejected")
-    header = [
-        "", "pixels", "accuracy", "relative size", "mean width (px)", "overestimation", "median width (px)",
-        "interval score (px)",
-    ]  # fmt: skip
+    header = ["", "pixels", "coverage", "mean width (px)", "median width (px)", "interval score (px)"]
     show(header, rows, scene.name)
     if not report["all"]["count"]:
         click.echo("no valid pixel has a known truth: check truth and mask")
@@ -94,10 +91,12 @@ def show_scene(scene: SceneMetrics) -> None:
     click.echo(f"disparity wrong by more than 1 px: {bad[0]}, by more than 3 px: {bad[1]}")
     if report["locking"] is not None:
         click.echo(f"locking to whole pixels (0 none, 1 whole pixels only): {_figure(report['locking'])}")
+    if report["median_error"] is not None:
+        click.echo(f"median of disparity - truth: {report['median_error']:+.3f} px")
     if report["tolerance"]:
         click.echo(f"truth up to {report['tolerance']:g} px outside an interval counts as inside")
     if report["bias"] is not None:
-        click.echo(f"median of disparity - truth, added to the truth: {_figure(report['bias'])} px")
+        click.echo(f"added to the truth before: {report['bias']:+.3f} px")
     if report["truth_outside_range"]:
         share = _figure(report["truth_outside_range"])
         click.echo(f"truth outside the search range, always missed: {share} (its sign: x_right = x_left + disparity)")
@@ -106,7 +105,13 @@ def show_scene(scene: SceneMetrics) -> None:
         for decile in report["deciles"]
     ]
     if deciles:
-        show(["confidence", "pixels", "accuracy", "mean width (px)"], deciles, "by decile of confidence")
+        show(["confidence", "pixels", "coverage", "mean width (px)"], deciles, "by decile of confidence")
+    high, low = report["high"]["accuracy"], report["low"]["accuracy"]
+    if high is not None and low is not None and high < low:
+        click.echo(
+            "confident pixels are covered less often than doubtful ones: their intervals are about a pixel wide, so "
+            "errors of the truth and of sub-pixel disparities count, while doubtful intervals are wide"
+        )
 
 
 # Columns of the figures of a surface model: key, and heading.
@@ -161,7 +166,10 @@ def _nominal_line(report: dict[str, Any]) -> str:
     """Return a line about the coverage asked for, or alpha."""
     if report["nominal"] is None:
         return "coverage asked for: unknown, so no interval scores"
-    return f"{_NOMINAL[report['nominal_is']]}: {report['nominal']:g}; the interval score judges for it, less is better"
+    return (
+        f"{_NOMINAL[report['nominal_is']]}: {report['nominal']:g}; interval score: width, and 2 / (1 - that) times "
+        "each miss, less is better"
+    )
 
 
 def registration_lines(found: dict[str, Any] | None) -> list[str]:
@@ -177,7 +185,10 @@ def registration_lines(found: dict[str, Any] | None) -> list[str]:
         deviations = ", ".join(f"{value:.2g} m" for value in found["deviation"])
         lines = [f"reference not moved: its shift is less than two standard deviations, {deviations}"]
     if not found["is_horizontal"]:
-        lines = [f"reference moved: height {up}; easting and northing cannot be determined here, as on flat ground"]
+        lines = [
+            f"reference moved: height {up}; easting and northing cannot be determined: flat ground, or a "
+            f"reference many cells off"
+        ]
     for when in ("before", "after"):
         figures = found[when]
         lines.append(
@@ -217,9 +228,7 @@ def _expected(figures: Mapping[str, float]) -> list[str]:
 
 def _areas(report: dict[str, Any], where: str) -> list[list[str]]:
     """Return rows for all pixels counted and for those of high and low confidence."""
-    columns = (
-        "accuracy", "relative_size", "mean_width", "relative_overestimation", "median_width", "interval_score",
-    )  # fmt: skip
+    columns = "accuracy", "mean_width", "median_width", "interval_score"
     names = {"all": "all pixels" if where else "valid pixels", "high": "high confidence", "low": "low confidence"}
     return [[name + where, *_measures(report[key], *columns)] for key, name in names.items()]
 

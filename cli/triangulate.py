@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from sat_intervals.cli.logs import warn
 from sat_intervals.cli.options import (
     FILE,
     SensorFiles,
@@ -82,8 +83,7 @@ def say_geometry(console: "Console", reports: dict[str, Any]) -> None:
                 f"{out}: lines of sight miss each other by {report['median_residual']:.2g} m in the median (so models "
                 "and grids fit together; neither the matches nor whether they belong to these images is tested)"
             )
-    for line in geometry_warnings(reports):
-        click.echo(line, err=True)
+    warn(geometry_warnings(reports))
 
 
 def geometry_warnings(reports: dict[str, Any]) -> list[str]:
@@ -94,13 +94,13 @@ def geometry_warnings(reports: dict[str, Any]) -> list[str]:
             lines.append(f"{out}: no points in {100 * report['lost']:.2g} %: grids or models have no values there")
         if report["beyond"] > _MOST_BEYOND * report["grid_step"]:
             lines.append(
-                f"warning: {out}: the left grid reaches {report['beyond']:.0f} px beyond the left image, more than "
+                f"{out}: the left grid reaches {report['beyond']:.0f} px beyond the left image, more than "
                 f"{_MOST_BEYOND} of its nodes: check that models and grids belong to these images, which must not be "
                 "cropped"
             )
         if report["median_residual"] > _SUSPECT:
             lines.append(
-                f"warning: {out}: lines of sight miss each other by {report['median_residual']:.2g} m in the median, "
+                f"{out}: lines of sight miss each other by {report['median_residual']:.2g} m in the median, "
                 "where matching models and grids give millimetres. Height errors may be many times larger: check that "
                 "the grids were made with these models"
             )

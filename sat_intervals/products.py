@@ -74,6 +74,9 @@ def cause(validity: np.ndarray) -> np.ndarray:
     return reasons & -reasons  # the lowest bit
 
 
+WIDTH = "width of the disparity interval"
+
+
 @dataclass(frozen=True)
 class Band:
     """One band of a file: name (the GeoTIFF description), unit ("" for none) and meaning."""

@@ -27,6 +27,7 @@ _BANDS = {"intervals.tif": len(BANDS), "validity.tif": 1}
 # Files that later commands add to a run: the command, and whether a file is of the run that finished at a time.
 _ADDED: dict[str, tuple[str, Callable[[Path, str], bool]]] = {
     "dsm.tif": ("dsm", is_surface_of),
+    "report.html": ("report", lambda file, finished: finished in file.read_text(encoding="utf-8")),
     "overview.png": ("plot", lambda file, finished: read_tags(file).get("Comment") == finished),
 }
 

@@ -72,6 +72,7 @@ def _report(inputs, bands, validity):
         "rows": None,
         "quality": {"noise": 0.41, "collars": {"left": {"value": 0.0, "share": 0.05}}},
         "warnings": ["left.tif: 5 % of the pixels are exactly 0"],
+        "verdict": "80 % valid, but see the warning",
         "validity_bits": {
             flag.name: {"bit": flag.bit, "meaning": flag.meaning, "invalid": flag.invalid} for flag in FLAGS
         },

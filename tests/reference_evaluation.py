@@ -19,6 +19,9 @@ def evaluate(scene, rules, remove_bias=False, with_rejected=False):
         bias = middle([float(scene.disparity[p]) - float(scene.truth[p]) for p in pixels(known & scene.valid)]) or 0.0
     report = figures(scene, rules, pixels(known & scene.valid), bias)
     report["bias"] = bias if remove_bias else None
+    report["median_error"] = middle(
+        [float(scene.disparity[p]) - float(scene.truth[p]) - bias for p in pixels(known & scene.valid)]
+    )
     report["tolerance"], report["nominal"] = rules.tolerance, rules.nominal
     truths = [float(scene.truth[p]) for p in pixels(known & scene.valid)]
     report["truth_is_whole"] = bool(truths) and all(truth.is_integer() for truth in truths)

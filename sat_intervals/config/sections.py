@@ -54,10 +54,12 @@ Exact = Annotated[Decimal, BeforeValidator(as_written), PlainSerializer(as_numbe
 # Disparities are stored as int16; within this limit the difference of any two also fits.
 # The engine and so mypy only see numbers: auto is replaced before a pair is matched, see `Disparity.is_auto`.
 AUTO: Any = "auto"
+# Largest disparity: bounds in steps and sentinels fit in 16 bits.
+MOST_PIXELS = 16000
 if TYPE_CHECKING:
     Pixels = int
 else:
-    Pixels = Annotated[int, Field(ge=-16000, le=16000)] | Literal["auto"]
+    Pixels = Annotated[int, Field(ge=-MOST_PIXELS, le=MOST_PIXELS)] | Literal["auto"]
 
 
 class StrictModel(BaseModel):

@@ -20,6 +20,7 @@ from sat_intervals.raster import (
     read_layers,
     read_place,
     resolution_of,
+    warn_of_no_data,
 )
 from sat_intervals.tiling import Grid, Window
 
@@ -88,6 +89,7 @@ def open_comparison(
         raise SatIntervalsError(f"{surface} is not a surface model of sat-intervals dsm: is it the --reference?")
     read_place(reference)
     check_reference(reference, surface)
+    warn_of_no_data(reference)
     assert place.pixel_size is not None
     resolution = resolution_of(reference, place)
     finer = max(1, round(place.pixel_size[0] / resolution))

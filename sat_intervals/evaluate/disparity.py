@@ -54,9 +54,10 @@ def evaluate_run(
     of truths outside the search range; ``locking``, how much more often disparities wrong by at most 1 px are near
     whole pixels than truths, 0 alike and 1 whole pixels only; ``deciles`` of confidence with their coverage.
     ``with_rejected`` contains the same over all pixels with an interval, None unless the run kept rejected pixels.
-    ``bias`` is the bias removed (pixels), None without ``remove_bias``. ``truth_is_whole`` is true if all truths of
-    valid pixels are whole numbers. ``nominal`` is the coverage or the alpha of the run, as ``nominal_is`` says, for
-    which ``interval_score`` judges. ``cost`` and ``tolerance`` are the settings used.
+    ``median_error`` is the median of disparity - truth that is left, ``bias`` the one removed before (pixels), None
+    without ``remove_bias``. ``truth_is_whole`` is true if all truths of valid pixels are whole numbers. ``nominal`` is
+    the coverage or the alpha of the run, as ``nominal_is`` says, for which ``interval_score`` judges. ``cost`` and
+    ``tolerance`` are the settings used.
 
     Raises
     ------
@@ -99,11 +100,13 @@ def evaluate(
     bias = _median_bias(strips()) if remove_bias else None
     criteria = replace(criteria, bias=bias or 0.0)
     kept, written = Metrics(criteria), Metrics(criteria)
-    is_whole = True
+    is_whole, errors = True, bias_histogram()
     for rows, first, last in with_halo(strips(), criteria.depth):
         chosen = rows.known & rows.valid
         is_whole = is_whole and bool((rows.truth[chosen] % 1 == 0).all())
         kept.add(*_evaluated(rows, chosen, first, last, criteria))
+        inner = slice(first, last)
+        errors.add((rows.disparity[inner].astype(np.float64) - rows.truth[inner] - criteria.bias)[chosen[inner]])
         if with_rejected:
             written.add(*_evaluated(rows, rows.known, first, last, criteria))
     report = kept.report()
@@ -112,6 +115,7 @@ def evaluate(
         "truth_is_whole": is_whole and report["all"]["count"] > 0,
         "tolerance": criteria.tolerance,
         "nominal": criteria.nominal,
+        "median_error": errors.median(),
         "bias": bias,
         "with_rejected": written.report() if with_rejected else None,
     }

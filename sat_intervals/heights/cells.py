@@ -109,7 +109,7 @@ class Tally:
         """Return the figures, see `make_surface`, with shares of so many cells."""
         median = self._widths.median()
         return {
-            **{name: self._counts[name] for name in ("points", "outliers", "open", "poor_cells")},
+            **{name: self._counts[name] for name in ("points", "outliers", "open", "border", "poor_cells")},
             "filled": self._filled / cells,
             "disagreeing": self._disagreeing / self._shared if self._shared else None,
             "median_half_width": None if median is None else median / 2,

@@ -19,6 +19,7 @@ from sat_intervals.raster import (
     Projection,
     files_of,
     geoid_grid,
+    horizontal_name,
     north_up,
     read_place,
     surface_file,
@@ -75,8 +76,8 @@ def make_surface(
     cells of several runs whose intervals do not overlap, None if there are none), ``without_intervals`` (folders of
     runs without intervals); ``bounds``; ``calibration`` (its name, None without one); ``median_half_width`` (metres)
     and ``wide``, the share of cells with bounds whose half width exceeds 20 m, both None without bounds; ``outliers``,
-    ``open`` and ``poor_cells``, the numbers of points and cells left out; ``geometry``, for each folder, how models and
-    grids fit, see `set_geometry`, and ``lost``, the share of the region where they have no values.
+    ``open``, ``border`` and ``poor_cells``, the numbers of points and cells left out; ``geometry``, for each folder,
+    how models and grids fit, see `set_geometry`, and ``lost``, the share of the region where they have no values.
 
     Raises
     ------
@@ -204,8 +205,7 @@ def _grid_of(path: Path, given: str | None) -> tuple[Cells, str]:
         raise SatIntervalsError(
             f"{path} has pixels of {across:g} x {down:g} m: give a north-up raster with square pixels"
         )
-    code = place.crs.to_epsg()
-    crs = f"EPSG:{code}" if code else place.crs.to_wkt()
+    crs = horizontal_name(place.crs)
     return Cells(place.transform.c, place.transform.f, across, rows, columns), crs
 
 

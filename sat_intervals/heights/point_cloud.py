@@ -16,12 +16,14 @@ from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.lattice import WINDOW, Extent, Ground, Lattice, joined
 from sat_intervals.kernels.disparity import median
 from sat_intervals.kernels.splat import BOUNDED, LOWER, UPPER, empty_cells, gather, mean_heights, medians, splat
-from sat_intervals.products import OPEN_ABOVE, OPEN_BELOW, Bands
+from sat_intervals.products import OPEN_ABOVE, OPEN_BELOW, RANGE_INCOMPLETE, Bands
 from sat_intervals.results import Run
 from sat_intervals.tiling import Grid, Tile, Window
 
 # Pixels around a point whose median outliers are compared with.
 _NEAR = 2
+# Metres from the median of the points near it at which a point does not widen the surface.
+_FAR = 20.0
 # The height among the values of a lattice.
 _HEIGHT = slice(2, 3)
 
@@ -88,6 +90,7 @@ class PointCloud:
 
     def _extent(self, window: Window) -> Extent | None:
         (x, y, height), _ = self._places(window, self.run.read_bands(window))
+        height[self._outlying(window, _FAR)] = np.nan
         x, y = x[np.isfinite(height)], y[np.isfinite(height)]
         return Extent(float(x.min()), float(y.min()), float(x.max()), float(y.max())) if x.size else None
 
@@ -97,7 +100,7 @@ class PointCloud:
         """Accumulate the points in a window of cells, see `kernels.splat`; ``radius`` in metres; ``ended`` stops it.
 
         Also return the numbers of ``points`` that fall in these cells, and of those there that are left out as
-        ``outliers`` or because their interval is ``open``.
+        ``outliers``, because their interval is ``open``, or at the ``border`` of the right image without confidence.
         """
         gathered, counts = empty_cells(window.height, window.width), Counter[str]()
         near = []
@@ -138,6 +141,10 @@ class PointCloud:
         if not self._choices.keeps_open:
             left_out["open"] = np.isfinite(height) & (bands.validity & np.uint16(OPEN_BELOW | OPEN_ABOVE) != 0)
             height[left_out["open"]] = np.nan
+        # beside missing data of the right image only wrong candidates may be left
+        is_doubtful = (bands.validity & np.uint16(RANGE_INCOMPLETE) != 0) & (bands.confidence == 0)
+        left_out["border"] = np.isfinite(height) & is_doubtful
+        height[left_out["border"]] = np.nan
         return places, left_out
 
     def _outlying(self, window: Window, limit: float) -> np.ndarray:

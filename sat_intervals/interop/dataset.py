@@ -10,7 +10,7 @@ from xarray.backends import BackendArray
 from xarray.core import indexing
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.products import FLAGS, INVALID, flag_attributes
+from sat_intervals.products import FLAGS, INVALID, WIDTH, flag_attributes
 from sat_intervals.raster import grid_mapping, read_layers, run_files
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
@@ -125,7 +125,7 @@ class Intervals:
     def width(self) -> xr.DataArray:
         """Return the width of the intervals in pixels, NaN where there is none."""
         width = self._dataset["upper"] - self._dataset["lower"]
-        return width.assign_attrs(long_name="width of the disparity interval", units="px")
+        return width.assign_attrs(long_name=WIDTH, units="px")
 
     def flags(self) -> xr.Dataset:
         """Return the decoded validity flags, see `decode_flags`."""

@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterator
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import FLAGS, SURFACE, Band, interval_bands
-from sat_intervals.raster import footprint, read_layers, read_place, write_file
+from sat_intervals.raster import footprint, read_layers, read_place, read_tags, write_file
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import strips
 
@@ -24,21 +25,34 @@ _COG = "image/tiff; application=geotiff; profile=cloud-optimized"
 _VALIDITY = Band("validity", "", "; ".join(f"bit {flag.bit} {flag.name}: {flag.meaning}" for flag in FLAGS))
 _STRIP = 1 << 22  # pixels
 _SHA256 = "1220"  # code and length of a multihash
+_FIRST = "1959-08-14T00:00:00Z"  # no satellite has taken an image before
 _DIGITS = 7  # of degrees: 1 cm
 
 
 def write_item(out: str | Path, *, taken: str | None = None, identifier: str | None = None) -> Path:
     """Write ``stac.json`` to the folder of a finished run: a STAC 1.1 item with its rasters as assets.
 
-    ``taken`` is when the left image was taken, ISO 8601 with a time zone; by default, when the run ended.
-    ``dsm.tif`` and ``overview.png`` are assets if they belong to this run.
+    ``taken`` is when the left image was taken, ISO 8601 with a time zone; by default the time in its TIFF tags. Without
+    one, it is null, between the first satellite image and the end of the run.
+    ``dsm.tif``, ``overview.png`` and ``report.html`` are assets if they belong to this run.
     """
     run = open_run(out)
     file = run.out / "stac.json"
     run.check_kept([file])
-    item = _item(run, _time(taken or run.report["finished"]), identifier or run.out.resolve().name)
+    item = _item(run, _times(run, taken), identifier or run.out.resolve().name)
     write_file(file, (json.dumps(item, indent=1, allow_nan=False) + "\n").encode())
     return file
+
+
+def _times(run: Run, taken: str | None) -> dict[str, str | None]:
+    """Return when the left image was taken, as STAC wants it."""
+    image = Path(run.report["inputs"]["left"]["path"])
+    if taken is None and image.is_file() and (tag := read_tags(image).get("TIFFTAG_DATETIME")):
+        with suppress(ValueError):
+            taken = datetime.strptime(tag, "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC).isoformat()
+    if taken is not None:
+        return {"datetime": _time(taken)}
+    return {"datetime": None, "start_datetime": _FIRST, "end_datetime": _time(run.report["finished"])}
 
 
 def _time(text: str) -> str:
@@ -51,7 +65,7 @@ def _time(text: str) -> str:
     return moment.astimezone(UTC).isoformat().replace("+00:00", "Z")
 
 
-def _item(run: Run, taken: str, identifier: str) -> dict[str, Any]:
+def _item(run: Run, times: dict[str, str | None], identifier: str) -> dict[str, Any]:
     assets = dict(_assets(run))
     corners = footprint(run.georeferencing, run.shape)
     if corners is None and "dsm" in assets:
@@ -64,7 +78,7 @@ def _item(run: Run, taken: str, identifier: str) -> dict[str, Any]:
         "id": identifier,
         "geometry": None,
         "properties": {
-            "datetime": taken,
+            **times,
             "created": _time(run.report["finished"]),
             "title": f"Disparity with intervals of {Path(run.report['inputs']['left']['path']).name}",
             "processing:software": run.report["versions"],
@@ -108,6 +122,9 @@ def _assets(run: Run) -> Iterator[tuple[str, dict[str, Any]]]:
     if run.has_current("overview.png"):
         maps = {"title": "Maps", "type": "image/png", "roles": ["overview"]}
         yield "overview", maps | _file(run.out / "overview.png")
+    if run.has_current("report.html"):
+        page = {"title": "Maps, profiles, histograms", "type": "text/html", "roles": ["overview"]}
+        yield "page", page | _file(run.out / "report.html")
 
 
 def _file(path: Path) -> dict[str, Any]:

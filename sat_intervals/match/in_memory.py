@@ -18,7 +18,7 @@ from sat_intervals.match.rows import Survey
 from sat_intervals.match.sampling import look, spots
 from sat_intervals.match.search_range import Found, NoRangeError, find_range, finest_step, reduced, with_range
 from sat_intervals.match.whole import cut, match_whole, whole_view
-from sat_intervals.products import flag_attributes, interval_bands
+from sat_intervals.products import WIDTH, flag_attributes, interval_bands
 from sat_intervals.tiling import Window
 
 _LOG = logging.getLogger(__name__)
@@ -26,7 +26,7 @@ _LOG = logging.getLogger(__name__)
 Array = np.ndarray | xr.DataArray
 
 
-def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) -> xr.Dataset:
+def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any] | None = None) -> xr.Dataset:
     """Match two epipolar images in memory.
 
     Parameters
@@ -36,15 +36,16 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
         the setting ``rows``. NaN, infinity and
         the masked pixels of a masked array are no data.
     config
-        Settings, or a mapping as `load_config` takes it; ``tiles`` has no effect. A search range that is auto is found
-        first.
+        Settings, or a mapping as `load_config` takes it, by default those of satellite images; ``tiles`` has no effect.
+        A search range that is auto is found first.
 
     Returns
     -------
     Dataset
-        ``disparity``, ``lower``, ``upper`` (pixels), ``confidence`` (0 to 1), float32, ``validity``, uint16 flags, and
-        ``sigma`` (pixels) if the settings ask for it; with the dimensions and coordinates of a left DataArray. The
-        attribute ``rows`` has the row offsets that were taken out of the right image, as JSON.
+        ``disparity``, ``lower``, ``upper``, ``width`` (pixels), ``confidence`` (0 to 1), float32, ``validity``, uint16
+        flags, and ``sigma`` (pixels) if the settings ask for it; with the dimensions and coordinates of a left
+        DataArray, else ``y`` and ``x``. The attribute ``rows`` has the row offsets that were taken out of the right
+        image, as JSON.
 
     Raises
     ------
@@ -74,13 +75,16 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
     if config.cost.needs_statistics:
         statistics = PairStatistics(*(statistics_of(_moments(image)) for image in images))
     final = match_whole(*images, config, statistics, ranges)
-    labels = left if isinstance(left, xr.DataArray) else xr.DataArray(images[0], dims=("row", "column"))
-    dataset = xr.Dataset(coords=labels.coords, attrs={"rows": json.dumps(asdict(rows))} if rows else {})
+    labels = left if isinstance(left, xr.DataArray) else xr.DataArray(images[0], dims=("y", "x"))
+    dataset = xr.Dataset(coords=labels.coords, attrs={"title": "disparity with intervals", "source": "sat-intervals"})
+    dataset.attrs |= {"preset": config.preset} if config.preset else {}
+    dataset.attrs |= {"rows": json.dumps(asdict(rows))} if rows else {}
     layers = (*final[:4], final.sigma) if config.products.sigma else final[:4]
     for band, layer in zip(interval_bands(sigma=config.products.sigma), layers, strict=True):
         attributes = {"long_name": band.meaning} | ({"units": band.unit} if band.unit else {})
         dataset[band.name] = xr.DataArray(layer, dims=labels.dims, attrs=attributes)
     dataset["validity"] = xr.DataArray(final.validity, dims=labels.dims, attrs=flag_attributes())
+    dataset["width"] = (dataset["upper"] - dataset["lower"]).assign_attrs(long_name=WIDTH, units="px")
     return dataset
 
 

@@ -106,7 +106,10 @@ class Survey:
         if rows == "none" or self.rows is None:
             return None
         if line := self.rows.contradiction:
-            raise SatIntervalsError(f"{line}: resample the pair, or give --rows none")
+            raise SatIntervalsError(
+                f"{line}: leave out the search range if it is given, check that both images show the same place, "
+                "resample the pair, or give --rows none"
+            )
         return self.rows.offsets if self.is_large else None
 
     def report(self) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sat_intervals.config import Config, load_config
+from sat_intervals.config.sections import MOST_PIXELS
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.components import component_sizes
 from sat_intervals.kernels.disparity import median
@@ -107,6 +108,11 @@ class Found:
 
 def with_range(config: Config, found: Found) -> Config:
     """The settings with a range that was found."""
+    if max(-found.minimum, found.maximum) > MOST_PIXELS:
+        raise NoRangeError(
+            f"the search range found is {found.minimum} to {found.maximum} px, beyond {MOST_PIXELS}: crop or shift the "
+            "images so that disparities are near 0"
+        )
     ends = {"minimum": found.minimum, "maximum": found.maximum, "open_ends": True}
     disparity = config.disparity.model_copy(update=ends)
     return config.model_copy(update={"disparity": disparity})

@@ -1,12 +1,12 @@
 """Read and write GeoTIFF: images, their georeferencing, and the files of a run. Only this folder imports rasterio."""
 
-from sat_intervals.raster.blocks import BLOCK, codec_versions, compressed, factors
+from sat_intervals.raster.blocks import BLOCK, codec_versions, compressed, factors, halved
 from sat_intervals.raster.cog import Part
 from sat_intervals.raster.files import RUN_FILES, File, points_file, ranges_file, run_files, surface_file, truth_file
 from sat_intervals.raster.files_of import files_of
 from sat_intervals.raster.frame import Frame, Vertical
-from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing, footprint
-from sat_intervals.raster.heightfield import GROUND, HeightRaster
+from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing, footprint, horizontal_name
+from sat_intervals.raster.heightfield import GROUND, HeightRaster, warn_of_no_data
 from sat_intervals.raster.identity import check_not_replaced
 from sat_intervals.raster.images import Image, check_pair, describe, open_image
 from sat_intervals.raster.layers import north_up, read_known, read_layers, read_shape, read_tags, write_layer
@@ -63,6 +63,8 @@ __all__ = [
     "footprint",
     "geoid_grid",
     "grid_mapping",
+    "halved",
+    "horizontal_name",
     "is_surface",
     "new_file",
     "north_up",
@@ -86,6 +88,7 @@ __all__ = [
     "tags_beside",
     "truth_file",
     "utm_of",
+    "warn_of_no_data",
     "write_file",
     "write_layer",
 ]

@@ -37,8 +37,22 @@ class CompressedRow(NamedTuple):
 
 
 def factors(height: int, width: int) -> list[int]:
-    """Return the factors of a file's levels: 1, and those of its overviews; pixel (i, j) is (factor i, factor j)."""
+    """Return the factors of a file's levels: 1, and those of its overviews, see `halved`."""
     return [1, *(2**level for level in range(1, 32) if max(height, width) > BLOCK << (level - 1))]
+
+
+def halved(bands: np.ndarray) -> np.ndarray:
+    """Return ``(bands, rows, columns)`` at half the size: means of the known of 4 values, or every other flag."""
+    if bands.dtype.kind != "f":
+        return bands[:, ::2, ::2]
+    rows, columns = (-(-size // 2) for size in bands.shape[1:])
+    total, count = np.zeros((len(bands), rows, columns), bands.dtype), np.zeros((len(bands), rows, columns), np.uint8)
+    for part in (bands[:, row::2, column::2] for row in (0, 1) for column in (0, 1)):
+        known, inner = np.isfinite(part), np.s_[:, : part.shape[1], : part.shape[2]]
+        total[inner] += np.where(known, part, 0)
+        count[inner] += known
+    with np.errstate(invalid="ignore"):
+        return np.asarray(total / count, bands.dtype)
 
 
 def compressed(bands: np.ndarray, file: File) -> CompressedRow:

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import pyproj
 from pyproj import Transformer
 from pyproj.exceptions import ProjError
 from rasterio.control import GroundControlPoint
@@ -101,6 +102,14 @@ class Georeferencing:
             known = {name: str(value) for name, value in errors.items() if value is not None}
             options["rpcs"] = self.rpcs.to_gdal() | known
         return options
+
+
+def horizontal_name(crs: CRS) -> str:
+    """Return code or WKT of a CRS of rasterio; of a compound one those of its horizontal part."""
+    found = pyproj.CRS.from_wkt(crs.to_wkt())
+    found = found.sub_crs_list[0] if found.is_compound else found
+    code = found.to_epsg()
+    return f"EPSG:{code}" if code else found.to_wkt()
 
 
 def footprint(place: Georeferencing, shape: tuple[int, int]) -> Corners | None:

@@ -1,5 +1,6 @@
 """Read a raster of reference heights in its own grid and CRS, in parts."""
 
+import logging
 import math
 import re
 from functools import lru_cache
@@ -22,6 +23,10 @@ GROUND = -600.0, 9500.0
 _METRE = re.compile(r"[\[(]?(m|met(re|er)s?|unknown)\b[^/*^\d]*|", re.IGNORECASE)
 # Side of a block in cells, and blocks in memory, a megabyte each: neighbouring windows share most of theirs.
 _BLOCK, _KEPT = 512, 128
+# Rows and columns that are looked at for no data, the share of a value that may be it, and metres from all others.
+_LOOKED, _COMMON, _AWAY = 2000, 0.002, 50.0
+
+_LOG = logging.getLogger(__name__)
 
 
 class HeightRaster:
@@ -30,6 +35,7 @@ class HeightRaster:
     def __init__(self, path: Path, crs: str | None, vertical: Vertical) -> None:
         """``crs`` replaces the CRS of the file."""
         self._image = open_image(path, band=1)
+        warn_of_no_data(self._image.path)
         place = self._image.georeferencing
         with opened(self._image.path) as dataset:
             own = dataset.crs.to_wkt() if dataset.crs else None
@@ -71,6 +77,26 @@ class HeightRaster:
         heights = (pixels * self._scale + self._offset).astype(np.float32)
         metres = heights * self.frame.unit
         return np.where((state == 0) & (metres >= GROUND[0]) & (metres <= GROUND[1]), heights, np.float32(np.nan))
+
+
+def warn_of_no_data(path: str | Path) -> None:
+    """Warn of a height that many cells have exactly, far from all others: no data that is not declared."""
+    with opened(str(path)) as dataset:
+        shape = min(_LOOKED, dataset.height), min(_LOOKED, dataset.width)
+        heights = dataset.read(1, out_shape=shape)[dataset.read_masks(1, out_shape=shape) != 0]
+    heights = heights[np.isfinite(heights)]
+    values, counts = np.unique(heights, return_counts=True)
+    if values.size < 2:
+        return
+    value, share = values[counts.argmax()], counts.max() / heights.size
+    low, high = np.quantile(heights[heights != value], (0.005, 0.995))
+    away = float(max(low - value, value - high))
+    if share > _COMMON and away > _AWAY:
+        _LOG.warning(
+            "%s: %.1f %% of its heights are exactly %.9g, %.0f m from the others: if it is no data, declare it, with "
+            "gdal_edit.py -a_nodata %.9g",
+            *(path, 100 * share, value, away, value),
+        )
 
 
 def other_unit(dataset: DatasetReader) -> str | None:

@@ -16,7 +16,7 @@ from sat_intervals.errors import InputError
 from sat_intervals.kernels.rows import RowOffsets
 from sat_intervals.raster import gdal
 from sat_intervals.raster.files_of import check_listed, files_of
-from sat_intervals.raster.georeferencing import Georeferencing
+from sat_intervals.raster.georeferencing import Georeferencing, horizontal_name
 from sat_intervals.raster.identity import identity
 from sat_intervals.tiling import Window
 
@@ -42,6 +42,7 @@ class Image:
     alpha: int | None  # band that is 0 where there is no data, counted from 1
     mask: str | None  # the user's mask: a file of the same size, not 0 where the image must not be used
     georeferencing: Georeferencing
+    nodata_given: bool = False  # whether ``nodata`` is the user's
     rows: RowOffsets | None = None  # how far rows of a right image lie from those of the left one; taken out on reading
 
 
@@ -59,7 +60,8 @@ def open_image(
     path
         Local file, URL, or any name that GDAL opens.
     band
-        Counted from 1; required if there are several, not counting an alpha band.
+        Counted from 1; required if there are several, not counting an alpha band. An alpha band that is named is read
+        as an image.
     nodata
         Replaces the file's value; a value that the file's type cannot hold matches no pixel. Mask and alpha band of the
         file still apply, and NaN and infinity are always no data.
@@ -75,8 +77,10 @@ def open_image(
     mask = None if mask is None else _absolute(mask)
     with opened(name) as dataset:
         check_listed(name, dataset)
-        alphas = [i for i, kind in enumerate(dataset.colorinterp, start=1) if kind == ColorInterp.alpha]
-        band = _chosen(name, [i for i in dataset.indexes if i not in alphas], band)
+        colours = enumerate(dataset.colorinterp, start=1)
+        alphas = [number for number, kind in colours if kind == ColorInterp.alpha and number != band]
+        others = [number for number in dataset.indexes if number not in alphas]
+        band = _chosen(name, others, alphas, band)
         image = Image(
             path=name,
             band=band,
@@ -88,6 +92,7 @@ def open_image(
             alpha=alphas[0] if alphas else None,
             mask=mask,
             georeferencing=Georeferencing.of(dataset),
+            nodata_given=nodata is not None,
         )
         if dataset.colorinterp[band - 1] == ColorInterp.palette:
             raise InputError(
@@ -97,6 +102,9 @@ def open_image(
         pages = len(dataset.subdatasets) if dataset.driver == "GTiff" else 0
     if pages > 1:
         _LOG.warning("%s has %d pages: the first is used; name another as GTIFF_DIR:2:%s", name, pages, name)
+    if alphas and len(others) > 1:
+        way_out = f"if it is an image band, give gdal_edit.py -colorinterp_{alphas[0]} undefined"
+        _LOG.warning("%s: band %d is read as alpha, 0 is no data: %s", name, alphas[0], way_out)
     if "complex" in image.dtype:
         raise InputError(f"{name}: band {band} is {image.dtype}, matching needs real values: give its amplitude")
     if image.mask is not None:
@@ -138,7 +146,7 @@ def check_pair(left: Image, right: Image, count: int) -> None:
         )
     here, there = left.georeferencing, right.georeferencing
     here_crs, there_crs = here.crs or here.gcps_crs, there.crs or there.gcps_crs
-    if here_crs and there_crs and here_crs != there_crs:
+    if here_crs and there_crs and here_crs != there_crs and horizontal_name(here_crs) != horizontal_name(there_crs):
         names = f"{here_crs.to_string()} and {there_crs.to_string()}"
         raise InputError(f"{pair} have different CRS, {names}: resample the pair together")
     sizes = here.pixel_size, there.pixel_size
@@ -175,15 +183,18 @@ def _absolute(path: str | os.PathLike[str]) -> str:
     return str(Path(name).absolute()) if os.path.exists(name) else name
 
 
-def _chosen(path: str, bands: list[int], band: int | None) -> int:
+def _chosen(path: str, bands: list[int], alphas: list[int], band: int | None) -> int:
     """Return the number of the band to match."""
     if not bands:
         raise InputError(f"{path} has no image band: give a raster, or one of its subdatasets")
+    there = f"band {bands[0]} only" if len(bands) == 1 else f"bands {bands[0]} to {bands[-1]}"
+    alpha = f" (band {alphas[0]} is read as alpha)" if alphas else ""
     if band is None and len(bands) > 1:
-        raise InputError(f"{path} has {len(bands)} bands: choose one of {bands[0]} to {bands[-1]} with --band")
+        raise InputError(
+            f"{path} has {there}{alpha}: choose one with --band, or give a file of one band (gdal_translate -b)"
+        )
     if band is not None and band not in bands:
-        there = f"band {bands[0]} only" if len(bands) == 1 else f"bands {bands[0]} to {bands[-1]}"
-        raise InputError(f"{path} has no image band {band}, it has {there}: choose with --band")
+        raise InputError(f"{path} has no image band {band}, it has {there}{alpha}: choose with --band")
     return bands[0] if band is None else band
 
 

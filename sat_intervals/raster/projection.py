@@ -15,6 +15,8 @@ from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.images import opened
 
 _GEOGRAPHIC = "EPSG:4326"
+# Degrees of latitude from which on UPS replaces UTM.
+_POLAR = 84.0
 # Degrees outside the area of a CRS that are accepted: the next UTM zone.
 _BEYOND = 6.0
 # Largest scale error of a map: above that of UTM in the next zone (1 %) and of polar maps at their edges (4 %).
@@ -24,8 +26,10 @@ _LARGEST_UNDULATION = 120.0
 
 
 def utm_of(longitude: float, latitude: float) -> str:
-    """Return the UTM zone of a place (degrees), such as ``EPSG:32637``."""
+    """Return the UTM zone of a place (degrees), such as ``EPSG:32637``, or the polar map of UPS."""
     area = AreaOfInterest(longitude, latitude, longitude, latitude)
+    if abs(latitude) > _POLAR:
+        return "EPSG:32661" if latitude > 0 else "EPSG:32761"
     zones = query_utm_crs_info(datum_name="WGS 84", area_of_interest=area)
     if not zones:
         raise SatIntervalsError(f"no UTM zone at longitude {longitude:.2f}, latitude {latitude:.2f}: give --crs")

@@ -12,7 +12,7 @@ from tempfile import TemporaryFile
 import numpy as np
 
 from sat_intervals.machine import usable_cores
-from sat_intervals.raster.blocks import BLOCK, COLUMNS, compressed, factors
+from sat_intervals.raster.blocks import BLOCK, COLUMNS, compressed, factors, halved
 from sat_intervals.raster.cog import Part
 from sat_intervals.raster.files import File
 
@@ -73,7 +73,7 @@ class Stream:
         out.flush()
         self.parts[level].append(Part(sizes, (level, start)))
         if level + 1 < len(self._shapes):
-            self._add(level + 1, rows[:, ::2, ::2])
+            self._add(level + 1, halved(rows))
 
     def copy_parts(self, path: Path, parts: Sequence[tuple[int, Part]]) -> None:
         """Write the parts into a file; see `CopyParts`."""

@@ -37,6 +37,7 @@ from sat_intervals.store.tiles import COSTS, FAILURES, PARTS, PIXELS, Tables, ho
 _THREADS = 2  # that copy parts which workers cannot copy: one reads while another writes
 
 _LOG = logging.getLogger(__name__)
+_WARNINGS = logging.getLogger("sat_intervals.report")  # a command prints them itself, below its table
 
 
 def assemble(job: Job, workers: Workers, seconds: dict[str, float], progress: Progress) -> dict[str, Any]:
@@ -57,7 +58,7 @@ def assemble(job: Job, workers: Workers, seconds: dict[str, float], progress: Pr
             check_unchanged(job.inputs, job.left, job.right, job.config)
         report = report_of(job, tables, scale, parts.values(), seconds)
         for line in report["warnings"]:
-            _LOG.warning("%s", line)
+            _WARNINGS.warning("%s", line)
         _publish(job, writer, made, report)
     return report
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from sat_intervals.config import Config
+from sat_intervals.config.sections import MOST_PIXELS
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.search_range import Found, with_range
@@ -94,5 +95,5 @@ def _row_of_cells(images: list[Image], window: Window) -> tuple[np.ndarray, np.n
     least = np.minimum.reduceat(np.floor(low).min(axis=0), starts)
     most = np.maximum.reduceat(np.ceil(high).max(axis=0), starts)
     has_gap = np.logical_or.reduceat(empty.any(axis=0), starts)
-    ends = np.clip(np.where(has_gap, [[1], [0]], [least, most]), -16000, 16000).astype(np.int16)
+    ends = np.clip(np.where(has_gap, [[1], [0]], [least, most]), -MOST_PIXELS, MOST_PIXELS).astype(np.int16)
     return ends[0], ends[1]

@@ -33,7 +33,7 @@ def match_pair(
     left: str | Path | Image,
     right: str | Path | Image,
     out: str | Path,
-    config: Any,
+    config: Any = None,
     *,
     window: Window | None = None,
     keep_tiles: bool = False,
@@ -50,8 +50,8 @@ def match_pair(
         Folder for ``intervals.tif``, ``validity.tif`` and ``run.json``. Finished tiles are kept there, or in
         ``cluster.store``, until the run is complete; after an interruption the same call resumes from them.
     config
-        Settings, or a source for `load_config`; ``cluster`` says where tiles are matched. A search range that is auto
-        is found from the whole images first, see `search_range`.
+        Settings, or a source for `load_config`, by default those of satellite images; ``cluster`` says where tiles are
+        matched. A search range that is auto is found from the whole images first, see `search_range`.
     window
         Region of the left image; by default all of it.
     keep_tiles

@@ -1,10 +1,7 @@
 """Plan a run: tiles, work, memory, disk, and the time estimated from a sample."""
 
-import logging
 import tempfile
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -19,7 +16,6 @@ from sat_intervals.match.schedule import blocks_of, handed_bytes, time_of
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
 from sat_intervals.raster import BLOCK, Image, file_bytes, part_bytes
-from sat_intervals.run import assemble
 from sat_intervals.run.checks import check_tiles, checked_pair, checked_region, fitted_to_jobs
 from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.pair import match_pair
@@ -137,7 +133,7 @@ def _expected(left: Image, right: Image, config: Config, workers: int, grid: Gri
     local = workers if config.cluster.kind in ("threads", "processes") else cores_of_process(config.cluster)
     fitting = usable_memory() // (PROCESS_BYTES + tile_bytes(one))
     together = range(max(1, min(local, usable_cores(), fitting)))
-    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(len(together)) as threads, _warned_once():
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(len(together)) as threads:
         outs = [Path(folder) / f"sample{i}" for i in together]
         samples = list(threads.map(lambda out: _sampled(left, right, out, one, grid.region, shape), outs))
     window = samples[0][0]
@@ -158,22 +154,6 @@ def _expected(left: Image, right: Image, config: Config, workers: int, grid: Gri
     parallel = time_of(blocks, min(workers, len(grid)), paths / max(1, 3 * len(blocks)), tiles / len(blocks))
     extra = paths / tiles if config.hands_states_on else work / pixels - 1
     return float(seconds["start"] + seconds["kernels"] + images + parallel + strips + inputs + files), extra
-
-
-@contextmanager
-def _warned_once() -> Iterator[None]:
-    """Drop warnings that another sample has given, all being of the same window."""
-    logger, given = logging.getLogger(assemble.__name__), list[str]()
-
-    def is_new(record: logging.LogRecord) -> bool:
-        given.append(record.getMessage())
-        return given.count(given[-1]) == 1
-
-    logger.addFilter(is_new)
-    try:
-        yield
-    finally:
-        logger.removeFilter(is_new)
 
 
 def _sampled(

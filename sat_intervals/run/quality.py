@@ -1,14 +1,18 @@
-"""Tell what is odd about a pair: search range, no data, rows, noise."""
+"""Tell what is odd about a run, by cause: no data, rows, search range, noise; and its verdict in one line."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sat_intervals.config import Disparity, unreached
+from sat_intervals.config import Config, Disparity, calibration_of, unreached
+from sat_intervals.match.patch import patch_windows
 from sat_intervals.match.rows import Survey
 from sat_intervals.raster import Image, read_window
 from sat_intervals.run.job import Job
+from sat_intervals.run.source import frame_of
+from sat_intervals.store.tiles import Tables
 from sat_intervals.tiling import Window
 
 # Disparities up to which refinement alone can widen an interval to all, and up to which usual ones are half of all.
@@ -19,6 +23,8 @@ _AMBIGUOUS_SHARE = 0.1
 _AT_ENDS, _AT_END = 0.005, 0.001
 # Share of the pixels of an image that make a collar worth a warning, and rows that are looked at.
 COLLAR, _ROWS = 0.01, 8
+# Times the usual width of intervals that are wide.
+_WIDE = 2.0
 # Rows that make a pair badly resampled, and the distance of matches that makes it noisy.
 _ROW_OFFSET, _NOISE = 1.0, 0.55
 
@@ -28,14 +34,29 @@ def is_plain(image: Image) -> bool:
     return image.nodata is None and not image.use_mask and image.alpha is None and image.mask is None
 
 
-def quality_of(job: Job) -> dict[str, Any]:
-    """Return the quality of a pair: ``noise``, see `noise_of`, and ``collars``, see `Found`."""
+def quality_of(job: Job, tables: Tables) -> dict[str, Any]:
+    """Return the quality of a pair.
+
+    ``noise``, see `noise_of`; ``collars``, see `Found`; ``whole``, the sides of which no pixel read is no data.
+    """
     region, sides = job.store.grid.region, (("left", job.left), ("right", job.right))
     if job.found:
         collars = job.found.collars
     else:
         collars = {side: collar for side, image in sides if (collar := _collar(image, region))}
-    return {"noise": job.survey and job.survey.noise, "collars": collars}
+    return {"noise": job.survey and job.survey.noise, "collars": collars, "whole": _whole(job, tables)}
+
+
+def _whole(job: Job, tables: Tables) -> list[str]:
+    """Return the sides of which no tile has read a pixel without data."""
+    whole, ranges = {"left", "right"}, job.ranges()
+    for tile in job.store.grid:
+        windows = patch_windows(frame_of(job, tile), job.config, ranges)
+        for side, image, window in zip(("left", "right"), (job.left, job.right), windows, strict=True):
+            inside = window.clipped(Window(0, 0, image.height, image.width))
+            if tables.records[tile.name]["usable_pixels"][side] < inside.height * inside.width:
+                whole.discard(side)
+    return sorted(whole)
 
 
 def _collar(image: Image, region: Window) -> dict[str, float] | None:
@@ -52,43 +73,103 @@ def _collar(image: Image, region: Window) -> dict[str, float] | None:
     return {"value": float(smallest), "share": round(float(runs.mean()), 4)} if runs.mean() > COLLAR else None
 
 
-def warnings_of(job: Job, counts: dict[str, Any], quality: dict[str, Any]) -> list[str]:
-    """Return the warnings about a run, one line each."""
-    search, path = job.config.disparity, job.left.path
-    lines = []
+def warnings_of(job: Job, counts: Mapping[str, Any], quality: Mapping[str, Any]) -> list[str]:
+    """Return the warnings about a run, one line each, the likeliest cause of all others first."""
+    paths, config = (job.left.path, job.right.path), job.config
+    is_census = config.cost.method == "census" and config.preset == "paper"
+    unseen = [
+        f"{image.path}: no pixel that was read is {image.nodata:.9g}, the no-data value given: check --nodata"
+        for side, image in (("left", job.left), ("right", job.right))
+        if image.nodata_given and side in quality["whole"]
+    ]
+    same = [f"{paths[0]} and {paths[1]} are the same image: give the left and the right one"] if _are_same(job) else []
+    lost = _rejected(counts, paths, was_found=bool(job.found))
+    rows = rows_left(job.survey, config.rows, job.right.path)
+    is_doubted = bool(quality["collars"] or (job.survey and job.survey.rows and job.survey.rows.contradiction))
+    of_range = [] if is_doubted else _doubts_of_range(counts, config.disparity, paths[0], was_found=bool(job.found))
+    noise = noise_line(job.survey, paths) if is_census else []
+    missed = unreached(config)
+    of_settings = [f"{paths[0]}: {missed}"] if missed else []
+    of_pair = lost or [*rows, *of_range, *noise]
+    return [*same, *collar_lines(quality["collars"], paths), *unseen, *of_pair, *of_settings]
+
+
+def _are_same(job: Job) -> bool:
+    """Return whether two files are copies of each other; members of one archive have the digest of the archive."""
+    of_both = (job.inputs["left"], job.inputs["right"])
+    here, there = ([file.get("sha256") for file in (of, *of["files"])] for of in of_both)
+    are_files = Path(job.left.path).is_file() and Path(job.right.path).is_file()
+    return are_files and job.left.band == job.right.band and here == there
+
+
+def _rejected(counts: Mapping[str, Any], paths: tuple[str, str], *, was_found: bool) -> list[str]:
+    """Return a warning if cross-checking rejects more than it keeps."""
+    rejected = counts["causes"]["occlusion"] + counts["causes"]["mismatch"]
+    if rejected <= counts["valid"]:
+        return []
+    share, range_too = rejected / (rejected + counts["valid"]), "" if was_found else ", and leave out the search range"
+    return [
+        f"{paths[0]} and {paths[1]}: cross-checking rejected {100 * share:.0f} % of the matches: check that both "
+        f"images show the same place{range_too}"
+    ]
+
+
+def _doubts_of_range(counts: Mapping[str, Any], search: Disparity, path: str, *, was_found: bool) -> list[str]:
+    """Return a warning if disparities or intervals reach the ends of the search range too often."""
     if ends := _ends(counts, search):
-        lines.append(f"{path}: {ends}" + ("" if job.found else ", or leave it out"))
+        return [f"{path}: {ends}" + ("" if was_found else ", or leave it out")]
     width = counts["median_interval_width"] or 0
     ambiguous = counts["ambiguous"] > _AMBIGUOUS_SHARE * counts["valid"] and search.count > _NARROW_RANGE
     if ambiguous or (2 * width > search.count and search.count > _SHORT_RANGE):
-        lines.append(
+        return [
             f"{path}: the interval of {counts['ambiguous']} of {counts['valid']} valid pixels is the whole search "
             f"range {search.minimum} to {search.maximum}, the median width is {width:g} px: check the search range, "
-            "and no-data values (--nodata), or the ground has no texture"
-        )
-    if missed := unreached(job.config):
-        lines.append(f"{path}: {missed}")
-    is_census = job.config.cost.method == "census" and job.config.preset == "paper"
-    doubts = doubts_of(quality["collars"], job.survey, (job.left.path, job.right.path), is_census=is_census)
-    return lines + doubts + rows_left(job.survey, job.config.rows, job.right.path)
+            "or the ground has no texture"
+        ]
+    return []
 
 
-def doubts_of(
-    collars: Mapping[str, Any], survey: Survey | None, paths: tuple[str, str], *, is_census: bool = True
-) -> list[str]:
-    """Return the warnings about a pair; ``is_census``: it is matched with the penalties for clean images."""
-    lines = [
+def verdict_of(counts: Mapping[str, Any], config: Config, warnings: Sequence[str]) -> str:
+    """Return one line on a run: valid pixels, and if intervals are as wide as usual for its settings."""
+    valid = f"{100 * counts['valid'] / max(1, counts['pixels']):.0f} % valid"
+    if warnings:
+        return f"{valid}, but see the warning{'s, the first one first' if len(warnings) > 1 else ''}"
+    width, usual = counts["median_interval_width"], _usual_width(config)
+    if width is None or usual is None:
+        return f"{valid}, nothing unusual"
+    if width > _WIDE * usual:
+        return f"{valid}, intervals wider than usual: median {width:.2f} px, {usual:.2f} px on the calibration's pairs"
+    return f"{valid}, intervals usual for this preset"
+
+
+def _usual_width(config: Config) -> float | None:
+    """Return the median width in pixels that the pairs of a calibration had at the coverage of a run."""
+    levels = config.cuts
+    if levels is None or levels.coverage is None:
+        return None
+    expected = calibration_of(config).provenance.get("expected", ())
+    found = [row["median_width"] for row in expected if row.get("coverage") == levels.coverage]
+    return float(found[0]) if found else None
+
+
+def collar_lines(collars: Mapping[str, Any], paths: tuple[str, str]) -> list[str]:
+    """Return warnings of no data along the borders of images that nothing declares."""
+    return [
         f"{path}: {100 * collars[side]['share']:.0f} % of the pixels are exactly {collars[side]['value']:.9g}, along "
         f"its borders, and no no-data value is declared: if it is no data, give --nodata {collars[side]['value']:.9g}"
         for side, path in zip(("left", "right"), paths, strict=True)
         if side in collars
     ]
-    if survey and (survey.noise or 0) > _NOISE and is_census:
-        lines.append(
-            f"{paths[0]} and {paths[1]}: matching pixels differ {survey.noise:.2f} times as much as "
-            "random pixels, the pair is noisy: try --preset satellite, or find penalties with calibrate --tune"
-        )
-    return lines
+
+
+def noise_line(survey: Survey | None, paths: tuple[str, str]) -> list[str]:
+    """Return a warning of a pair that is too noisy for the penalties of clean images."""
+    if survey is None or (survey.noise or 0) <= _NOISE:
+        return []
+    return [
+        f"{paths[0]} and {paths[1]}: matching pixels differ {survey.noise:.2f} times as much as random pixels, the "
+        "pair is noisy: try --preset satellite, or find penalties with calibrate --tune"
+    ]
 
 
 def rows_left(survey: Survey | None, rows: str, path: str) -> list[str]:
@@ -108,7 +189,7 @@ def rows_left(survey: Survey | None, rows: str, path: str) -> list[str]:
     return []
 
 
-def _ends(counts: dict[str, Any], search: Disparity) -> str:
+def _ends(counts: Mapping[str, Any], search: Disparity) -> str:
     """Return a line that names a wider range if many disparities are at the ends of the range, else nothing."""
     low, high = (counts["range_ends"][end] / max(1, counts["valid"]) for end in ("minimum", "maximum"))
     if low + high <= _AT_ENDS:

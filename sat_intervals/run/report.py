@@ -14,7 +14,7 @@ from sat_intervals.match.seams import seam_report
 from sat_intervals.match.statistics import Tally
 from sat_intervals.products import FLAGS
 from sat_intervals.run.job import Job, origin_of
-from sat_intervals.run.quality import quality_of, warnings_of
+from sat_intervals.run.quality import quality_of, verdict_of, warnings_of
 from sat_intervals.store.tiles import Tables
 
 # Meanings of some of the counts, for readers of run.json.
@@ -67,7 +67,7 @@ def report_of(
     tally = Tally(config.disparity.count, config.disparity.minimum)
     for part in parts:
         tally.merge(part.get("counts", {}))
-    counts, quality = tally.report(), quality_of(job)
+    counts, quality = tally.report(), quality_of(job, tables)
     of_tiles = [record["seconds"] for record in tables.records.values()]
     seconds |= {f"tiles.{stage}": sum(each[stage] for each in of_tiles) for stage in ("read", "match", "write")}
     seconds["total"] = sum(value for stage, value in seconds.items() if "." not in stage)
@@ -102,5 +102,6 @@ def report_of(
         "seconds": {stage: round(value, 3) for stage, value in seconds.items()},
         "versions": dict(_versions()),
         "quality": quality,
-        "warnings": warnings_of(job, counts, quality),
+        "warnings": (warnings := warnings_of(job, counts, quality)),
+        "verdict": verdict_of(counts, config, warnings),
     }

@@ -29,7 +29,7 @@ from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress, logged_stage
 from sat_intervals.raster import Image, read_views, read_window
 from sat_intervals.run.connection import Connection
-from sat_intervals.run.quality import COLLAR, is_plain
+from sat_intervals.run.quality import COLLAR, collar_lines, is_plain
 from sat_intervals.run.workers import Task, Workers, picklable_errors, reason, results
 from sat_intervals.tiling import Grid, Window
 
@@ -97,9 +97,10 @@ def search_range(workers: Workers, left: Image, right: Image, progress: Progress
     try:
         found_range, _ = find_range(small[0], small[1], step, (left.height, left.width))
     except NoRangeError as error:
+        hints = "".join(f"; {line}" for line in collar_lines(collars, (left.path, right.path)))
         raise NoRangeError(
-            f"{left.path} and {right.path}: {error}: give the search range with --disparity MIN MAX, or check that the "
-            "images are an epipolar pair"
+            f"{left.path} and {right.path}: {error}{hints}: give the search range with --disparity MIN MAX, or check "
+            "that the images are an epipolar pair"
         ) from None
     return replace(found_range.fitted(right.width), collars=collars)
 

@@ -54,7 +54,8 @@ def check_folder(out: Path, *, overwrite: bool) -> None:
     is_begun = os.path.exists(home_of(out) / MANIFEST)  # a death may have left rasters, but no report
     if there := [name for name in OUTPUTS if os.path.lexists(out / name) and (not is_begun or name == RUN_REPORT)]:
         raise SatIntervalsError(
-            f"{out / there[0]} exists and is of no complete run: move it away, choose another folder or --overwrite"
+            f"{out / there[0]} exists and is of no complete run: move it away, choose another folder or "
+            "--overwrite (overwrite=True)"
         )
 
 
@@ -78,11 +79,12 @@ def next_step(
         kind = ChangedInputError if any(change.startswith("inputs.") for change in changes) else StoreError
         raise kind(
             f"{home} holds the tiles of another run: {'; '.join(changes)} "
-            "(use the same settings and inputs to resume, or --overwrite to start again)"
+            "(use the same settings and inputs to resume, or --overwrite, in Python overwrite=True, to start again)"
         )
     if report is not None:
         raise SatIntervalsError(
-            f"{out} already holds {_other_run(report, manifest, settings)}: choose another folder or --overwrite"
+            f"{out} already holds {_other_run(report, manifest, settings)}: choose another folder or "
+            "--overwrite (overwrite=True)"
         )
     check_folder(out, overwrite=False)
     return "resume" if there else "start"

@@ -16,7 +16,7 @@ from sat_intervals.match.postprocess import ConfidenceScale, RawRows, halo, post
 from sat_intervals.match.refinement import pixel_windows, pixels_of
 from sat_intervals.match.statistics import Tally
 from sat_intervals.progress import Progress
-from sat_intervals.raster import BLOCK, RUN_FILES, codec_versions, compressed, factors, read_views
+from sat_intervals.raster import BLOCK, RUN_FILES, codec_versions, compressed, factors, halved, read_views
 from sat_intervals.run.job import Job
 from sat_intervals.run.state import files_of_run
 from sat_intervals.run.workers import Task, Workers, check_not_full, computing, picklable_errors, reason, results
@@ -184,7 +184,7 @@ def _write(job: Job, of: str, key: PartKey, rasters: list[np.ndarray], **meta: A
             yield file.kind, np.frombuffer(made.content, np.uint8)
             del made
             if not is_top:
-                yield _HALF.format(file.kind), raster[:, ::2, ::2]
+                yield _HALF.format(file.kind), halved(raster)
 
     job.store.write(PARTS, part_name(key), arrays(), of=of, blocks=blocks, **meta)
 

@@ -125,6 +125,7 @@ def add_histogram(bar: Colorbar, widths: np.ndarray, end: float, step: float) ->
     side = bar.ax.inset_axes((-4.3, 0, 4.1, 1))
     shares = np.maximum(counts / known.size, _LEAST_SHARE)
     side.stairs(shares, bar.norm(edges), baseline=_LEAST_SHARE, orientation="horizontal", fill=True, color=INK)
+    side.set_title("share", fontsize=8, color=INK, loc="center", pad=2)
     side.set(xscale="log", xlim=(1, _LEAST_SHARE), ylim=(0, 1), yticks=[])
     side.set_xticks([1, 0.01], ["100 %", "1 %"], fontsize=8, color=INK)
     side.set_xticks([], minor=True)

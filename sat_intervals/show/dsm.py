@@ -56,6 +56,7 @@ def draw_surface(surface: Path, target: Path, dpi: int = DPI) -> None:
     ]
     if not np.isfinite(bands["agreement"]).any():
         layers[2] = MapLayer("Confidence", "0 to 1", bands["confidence"], "cividis", (0, 1))
+    layers = [layer for layer in layers if np.isfinite(layer.values).any()]
     step = "" if drawn == shape else f", {drawn[0]} x {drawn[1]} of them drawn"
     filled = f"{100 * np.isfinite(height).mean():.1f} % filled"
     code = place.crs.to_epsg()
@@ -69,8 +70,12 @@ def draw_surface(surface: Path, target: Path, dpi: int = DPI) -> None:
         draw_map(first, frame, relief, "Hillshade, sun in the north-west; blue: no data", cmap="gray", vmin=0, vmax=1)
         say_empty(first, relief, "no value")
         first.set_facecolor(_NO_DATA)  # flat ground is grey too
-        bars = [draw_layer(panel, frame, layer) for panel, layer in zip(panels, layers, strict=True)]
-        add_histogram(bars[1], halves, end, step=end / 40)
+        for panel, layer in zip(panels, layers, strict=False):
+            bar = draw_layer(panel, frame, layer)
+            if layer.values is halves:
+                add_histogram(bar, halves, end, step=end / 40)
+        for panel in panels[len(layers) :]:
+            panel.remove()
 
 
 def _middle_and_end(halves: np.ndarray) -> tuple[str, float]:

@@ -26,6 +26,7 @@ from sat_intervals.show.legend import PIXEL_CLASSES, SKY, VERMILION, class_count
 
 _PANEL, _LARGE = 4.2, 8.0  # inches of the longer side of a map
 _TEXT = 8.5  # inches, width of the text above a map
+_LETTERS = 13  # in an inch of a title
 _EDGE = "#888888"
 _WIDE = 10  # percent of widths beyond the end of their scale: low-confidence areas are often as wide as the range
 
@@ -40,21 +41,34 @@ def draw_overview(results: Results, target: Path, dpi: int = DPI) -> None:
     disparity = np.where(valid, bands.disparity, np.nan)
     widths = np.where(valid, bands.upper - bands.lower, np.nan)
     search, end = results.config.disparity, widest(widths, _WIDE)
-    layers = (
+    maps = (
         MapLayer("Disparity", "px", disparity, "viridis", limits(disparity, (search.minimum, search.maximum))),
         MapLayer("Interval width", "px", widths, "magma", (0, end), 0.5),
         MapLayer("Confidence", "0 to 1", bands.confidence, "cividis", (0, 1)),
     )
+    layers = [layer for layer in maps if np.isfinite(layer.values).any() or not valid.any()]
     frame = Frame.of(results.shape)
     size = columns * (width + 1.0), rows * (height + 0.6) + 0.3
     ratio = results.region.height * results.region.width / (shape[0] * shape[1])
     thinned = [f"one pixel in {ratio:,.{0 if ratio >= 10 else 1}f} shown"] if shape != results.shape else []
-    with page(target, size, dpi, _caption(results, thinned), results.report["finished"]) as figure:
+    words = [results.report["verdict"], *(f"warning: {line}" for line in results.report["warnings"])]
+    title = "\n".join([_caption(results, thinned), *(fill(line, round(_LETTERS * size[0])) for line in words)])
+    with page(target, size, dpi, title, results.report["finished"]) as figure:
         panels = figure.subplots(rows, columns, squeeze=False).ravel()
+        for panel in panels[len(layers) + 3 :]:
+            panel.remove()
         _draw_grey(panels[0], frame, bands.image, limits(bands.image))
-        bars = [draw_layer(panel, frame, layer) for panel, layer in zip(panels[1:4], layers, strict=True)]
-        add_histogram(bars[1], widths, end, step=1.0)
-        _draw_validity(panels[4], panels[5], frame, bands.validity, class_counts(results.report["counts"]))
+        for panel, layer in zip(panels[1:], layers, strict=False):
+            bar = draw_layer(panel, frame, layer)
+            if layer.values is widths:
+                add_histogram(bar, widths, end, step=1.0)
+        _draw_validity(
+            panels[len(layers) + 1],
+            panels[len(layers) + 2],
+            frame,
+            bands.validity,
+            class_counts(results.report["counts"]),
+        )
 
 
 def draw_errors(results: Results, target: Path, dpi: int = DPI) -> None:

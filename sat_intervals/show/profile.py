@@ -15,7 +15,7 @@ from sat_intervals.tiling import Window
 
 _WIDTH, _STRIP = 12.0, 1.0  # inches: of the page, and height of the image above a profile
 _KEYS = 4  # entries in a row of a legend
-_LOW = "#d4d4d4"
+_LOW, _BARS = "#d4d4d4", 9
 
 
 def draw_profile(
@@ -30,7 +30,7 @@ def draw_profile(
     valid = bands.valid
     lines = [np.where(valid, band, np.nan) for band in (bands.lower, bands.upper, bands.disparity)]
     # Draw each pixel as a step, visible even between invalid neighbours.
-    lines += [bands.truth, results.low(bands)]
+    lines += [bands.truth, _areas(results.low(bands))]
     lower, upper, disparity, truth, low = (np.repeat(line[0, first : last + 1], 2) for line in lines)
     edges = np.repeat(np.arange(first, last + 2) - 0.5, 2)[1:-1]
     has_intervals = results.config.interval is not None
@@ -52,6 +52,12 @@ def draw_profile(
             search = results.config.disparity
             chart.set_ylim(search.minimum - 0.5, search.maximum + 0.5)
         say_empty(chart, disparity, "no valid pixel")
+
+
+def _areas(low: np.ndarray) -> np.ndarray:
+    """Return where most of 9 columns have low confidence: single pixels would make a barcode."""
+    padded = np.pad(low[0].astype(int), _BARS // 2, mode="edge")
+    return np.asarray(np.convolve(padded, np.ones(_BARS, int), mode="valid") > _BARS // 2)[np.newaxis]
 
 
 def draw_curve(results: Results, target: Path, row: int, column: int, dpi: int = DPI) -> None:

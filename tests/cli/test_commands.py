@@ -127,7 +127,7 @@ def done(folder, tmp_path_factory):
         ({"right": "zone.tif"}, ["left.tif", "zone.tif have different CRS, EPSG:32631 and EPSG:32632", "resample"]),
         ({"right": "metre.tif"}, ["metre.tif have different pixel sizes, 0.5 x 0.5 and 1 x 1", "resample"]),
         ({"right": "complex.tif"}, ["complex.tif: band 1 is complex64", "give its amplitude"]),
-        ({"right": "bands.tif"}, ["bands.tif has 3 bands: choose one of 1 to 3 with --band"]),
+        ({"right": "bands.tif"}, ["bands.tif has bands 1 to 3: choose one with --band"]),
     ],
     ids=lambda value: "-".join(value.values()) if isinstance(value, dict) else "",
 )
@@ -468,7 +468,7 @@ def test_match__shows_a_warning_in_a_line(folder, tmp_path, monkeypatch):
 
     monkeypatch.setattr("sat_intervals.run.pair.match_pair", warn)
     arguments = matching(folder, tmp_path / "out")
-    assert invoke(*arguments).stderr == "sat-intervals: 3 doubts\nsat-intervals: in vain\n"
+    assert invoke(*arguments).stderr == "warning: 3 doubts\nsat-intervals: in vain\n"
     words = logged(invoke(*arguments, "--debug").stderr)
     assert words == [
         ("sat_intervals.cli.logs", "main match begins"),
@@ -574,10 +574,8 @@ def test_match__prints_plain_lines_and_a_table(done):
     assert "\x1b" not in result.stdout
     lines = result.stdout.splitlines()
     assert lines[0].startswith("comparing rows")
-    assert any(re.fullmatch(r"matching tiles: \d+/20, (\d+/s|\d+ s each), \d+ s left", line) for line in lines)
-    assert "matching tiles: 20/20" in lines
-    assert "postprocessing rows: 200/200" in lines
-    assert "writing files: 2/2" in lines
+    stages = ["matching tiles: 20", "postprocessing rows: 200", "writing files: 2"]
+    assert [line for line in lines if line.startswith(("matching", "postprocessing", "writing"))] == stages
     assert lines[-4:-1] == [str(out / name) for name in ("intervals.tif", "validity.tif", "run.json")]
     assert lines[-1] == f"next: sat-intervals report {out}"
     report = json.loads((out / "run.json").read_text())
@@ -586,7 +584,7 @@ def test_match__prints_plain_lines_and_a_table(done):
     share = 100 * report["counts"]["valid"] / report["counts"]["pixels"]
     assert re.search(rf"^valid pixels +{share:.1f} %$", result.stdout, re.MULTILINE)
     assert re.search(r"^median interval width +\d+\.\d\d px$", result.stdout, re.MULTILINE)
-    for cause in ("left window", "occlusion", "mismatch", "low confidence, of valid pixels"):
+    for cause in ("no data or border", "occlusion", "mismatch", "low confidence, of valid pixels"):
         assert re.search(rf"^ *{cause} +\d+\.\d %$", result.stdout, re.MULTILINE)
     assert re.search(r"^time +\d+\.\d s$", result.stdout, re.MULTILINE)
 

@@ -13,17 +13,17 @@ COUNTS = {"pixels": 200, "valid": 150, "median_interval_width": 2.5}
 def test_batch_summary__shows_surfaces_of_the_pairs_that_have_one(capsys):
     surface = {"filled": 0.876, "median_half_width": 1.25}
     report = {
-        "a": {"state": "done", "counts": COUNTS, "surface": surface},
+        "a": {"state": "done", "counts": COUNTS, "surface": surface, "warnings": ["rows"]},
         "b": {"state": "done", "counts": COUNTS, "surface": surface | {"median_half_width": None}},
         "c": {"state": "failed", "counts": COUNTS, "error": "no model"},
     }
     Console(quiet=False).batch_summary(report)
     head, *rows = (line.split() for line in capsys.readouterr().out.splitlines())
-    assert head == ["pair", "state", "valid", "median", "width", "filled", "median", "half", "width"]
+    assert head == ["pair", "state", "valid", "median", "width", "filled", "median", "half", "width", "warnings"]
     assert rows == [
-        ["a", "done", "75.0", "%", "2.50", "px", "87.6", "%", "+-1.25", "m"],
-        ["b", "done", "75.0", "%", "2.50", "px", "87.6", "%"],
-        ["c", "failed", "75.0", "%", "2.50", "px"],
+        ["a", "done", "75.0", "%", "2.50", "px", "87.6", "%", "+-1.25", "m", "1"],
+        ["b", "done", "75.0", "%", "2.50", "px", "87.6", "%", "0"],
+        ["c", "failed", "75.0", "%", "2.50", "px", "0"],
     ]
     Console(quiet=False).batch_summary({"c": report["c"]})
     assert "filled" not in capsys.readouterr().out

@@ -355,6 +355,16 @@ def test_command__suggests_a_tolerance_for_a_truth_of_whole_pixels(run, pair, tm
     assert command("evaluate", run, "--truth", tmp_path / "whole.tif", "--tolerance", "0.5")[2] == ""
 
 
+def test_command__advises_to_remove_a_bias(run, pair, tmp_path):
+    with rasterio.open(pair / "truth.tif") as dataset:
+        write(tmp_path / "moved.tif", dataset.read(1) + 1.7, float("nan"))
+    status, text, said = command("evaluate", run, "--truth", tmp_path / "moved.tif")
+    found = float(re.search(r"median of disparity - truth: ([+-]\d\.\d+) px", text)[1])
+    assert (status, found) == (0, pytest.approx(-1.7, abs=0.1))
+    assert f"warning: {run}: the median of disparity - truth is -1." in said
+    assert "try --remove-bias" in said
+
+
 def test_command__prints_the_form_of_json(run):
     status, text, _ = command("evaluate", run, "--json")
     report = json.loads(text)
@@ -375,12 +385,14 @@ def test_command__prints_one_run(run, pair):
     assert lines[2].startswith("valid pixels ")
     figures = evaluate_run(run, tolerance=0.25, remove_bias=True)
     assert lines[2].split()[2:5] == [str(figures["all"]["count"])] + [
-        f"{figures['all'][name]:.3f}" for name in ("accuracy", "relative_size")
+        f"{figures['all'][name]:.3f}" for name in ("accuracy", "mean_width")
     ]
-    assert "alpha: 0.9; the interval score judges for it, less is better" in lines
+    assert any(line.startswith("alpha: 0.9; interval score: width, and 2 / (1 - that)") for line in lines)
     assert "truth up to 0.25 px outside an interval counts as inside" in lines
-    assert f"median of disparity - truth, added to the truth: {figures['bias']:.3f} px" in lines
-    assert len(lines[lines.index("by decile of confidence") :]) == 2 + len(figures["deciles"])
+    assert f"median of disparity - truth: {figures['median_error']:+.3f} px" in lines
+    assert f"added to the truth before: {figures['bias']:+.3f} px" in lines
+    has_note = figures["high"]["accuracy"] < figures["low"]["accuracy"]
+    assert len(lines[lines.index("by decile of confidence") :]) == 2 + len(figures["deciles"]) + has_note
 
 
 def test_command__matches_pairs_and_prints_a_table(pair, run, tmp_path):

@@ -23,7 +23,7 @@ from sat_intervals.heights.choices import BOUNDS, SurfaceChoices
 from sat_intervals.heights.dsm import make_surface
 from sat_intervals.heights.geometry import Geometry
 from sat_intervals.heights.lattice import Lattice
-from sat_intervals.products import OPEN_ABOVE, SURFACE
+from sat_intervals.products import OPEN_ABOVE, RANGE_INCOMPLETE, SURFACE
 from sat_intervals.raster import Projection, north_up, write_layer
 from sat_intervals.raster.projection import transformed
 
@@ -118,6 +118,28 @@ def test_make_surface__a_point_reaches_the_cell_it_falls_in_at_any_radius(tmp_pa
     assert_allclose(surface[0, row, column], [10, 20], atol=1e-4)
     assert np.isfinite(surface[0]).sum() == 2
     assert np.isnan(surface[BAND["confidence"]]).all()  # of a run without confidence
+
+
+def test_make_surface__a_point_far_from_its_neighbours_does_not_stretch_it(tmp_path):
+    x, y = np.meshgrid(np.arange(0.5, 20), -np.arange(0.5, 20))
+    height = np.full(x.shape, 50.0)
+    plain, place, _ = surface_of([write_points(tmp_path / "a", x, y, height)], tmp_path)
+    height[11, 6], x[11, 6] = 150.0, -370.0
+    wrong, moved, report = surface_of([write_points(tmp_path / "b", x, y, height)], tmp_path)
+    assert (moved, wrong.shape) == (place, plain.shape)
+    assert report["points"] == x.size - 1
+
+
+def test_make_surface__leaves_out_points_beside_missing_data_without_confidence(tmp_path):
+    x, y = np.meshgrid(np.arange(0.5, 12), -np.arange(0.5, 9))
+    confidence, validity = np.full(x.shape, 0.5), np.zeros(x.shape, np.uint16)
+    validity[7:], confidence[8], confidence[2, 4] = RANGE_INCOMPLETE, 0.0, 0.0
+    out = write_points(tmp_path / "a", x, y, 0 * x + 30, confidence=confidence, validity=validity)
+    surface, place, report = surface_of([out], tmp_path, radius=0.1)
+    row, column = cell_of(place, LEFT + x[:8], TOP + y[:8])
+    assert np.isfinite(surface[0, row, column]).all()
+    assert np.isfinite(surface[0]).sum() == row.size
+    assert (report["border"], report["points"]) == (12, x.size - 12)
 
 
 def test_make_surface__of_a_run_that_was_moved(tmp_path):

@@ -95,7 +95,8 @@ def test_write_item__without_georeferencing_and_valid_pixels(tmp_path, monkeypat
     assert invoke("stac", out).exit_code == 0
     item = json.loads((out / "stac.json").read_text())
     assert (item["geometry"], "bbox" in item, item["id"]) == (None, False, "out")
-    assert item["properties"]["datetime"] == item["properties"]["created"] == "2026-11-21T12:00:00Z"
+    assert item["properties"]["datetime"] is None
+    assert item["properties"]["end_datetime"] == item["properties"]["created"] == "2026-11-21T12:00:00Z"
     assert item["assets"]["intervals"]["proj:code"] is None
     assert item["assets"]["intervals"]["bands"][0]["statistics"] == {"valid_percent": 0}
 

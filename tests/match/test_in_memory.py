@@ -96,21 +96,22 @@ def test_match_arrays__keeps_dimensions_and_coordinates_of_the_left(scene, expec
     found = match_arrays(labelled, xr.DataArray(with_nan(right), dims=("line", "sample")), config)
     check(found, expected)
     assert all(found[name].dims == ("y", "x") for name in found.data_vars)
+    found.attrs.clear()
     xr.testing.assert_identical(found.coords.to_dataset(), labelled.coords.to_dataset())
 
 
 def test_match_arrays__names_the_dimensions_of_plain_arrays(scene):
     left, right, config = scene
     found = match_arrays(left, with_nan(right), config)
-    assert dict(found.sizes) == {"row": left.shape[0], "column": left.shape[1]}
+    assert dict(found.sizes) == {"y": left.shape[0], "x": left.shape[1]}
     assert not found.coords
 
 
 def test_match_arrays__says_what_its_variables_are(scene, tmp_path):
     left, right, config = scene
     found = match_arrays(left, right, config)
-    assert list(found.data_vars) == [*BAND_NAMES, "validity"]
-    assert [found[name].dtype for name in found.data_vars] == [np.float32] * 4 + [np.uint16]
+    assert list(found.data_vars) == [*BAND_NAMES, "validity", "width"]
+    assert [found[name].dtype for name in found.data_vars] == [np.float32] * 4 + [np.uint16, np.float32]
     assert [found[name].attrs.get("units") for name in BAND_NAMES] == ["px", "px", "px", None]
     assert all(found[name].attrs["long_name"] for name in found.data_vars)
     flags = found["validity"].attrs

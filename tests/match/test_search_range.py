@@ -3,9 +3,18 @@
 import numpy as np
 import pytest
 
-from sat_intervals import match_arrays
+from sat_intervals import load_config, match_arrays
 from sat_intervals.demo import make_scene
-from sat_intervals.match.search_range import Found, NoRangeError, Step, collar, find_range, finest_step, reduced
+from sat_intervals.match.search_range import (
+    Found,
+    NoRangeError,
+    Step,
+    collar,
+    find_range,
+    finest_step,
+    reduced,
+    with_range,
+)
 
 
 @pytest.fixture(scope="module")
@@ -95,3 +104,11 @@ def test_match_arrays__finds_the_range_that_is_not_given(scene):
     found = searched(left.filled(0), right.filled(0))
     search = {"minimum": found.minimum, "maximum": found.maximum, "open_ends": True}
     assert match_arrays(left, right, {}).identical(match_arrays(left, right, {"disparity": search}))
+
+
+@pytest.mark.parametrize("ends", [(-17_100, -16_900), (15_990, 16_010)])
+def test_with_range__refuses_a_range_that_no_settings_hold(ends):
+    config = load_config({"disparity": {"minimum": "auto", "maximum": "auto"}})
+    with pytest.raises(NoRangeError, match="beyond 16000: crop or shift the images"):
+        with_range(config, Found(*ends, matched=0.5, levels=()))
+    assert load_config(with_range(config, Found(-16_000, -15_900, 0.5, ())).model_dump()).disparity.minimum == -16_000

@@ -14,7 +14,7 @@ from rio_cogeo.cogeo import cog_validate
 
 from sat_intervals.products import Band
 from sat_intervals.raster import RUN_FILES, File, Georeferencing, blocks, cog, north_up, points_file, run_files
-from sat_intervals.raster.blocks import BLOCK, codec_versions, compressed, factors
+from sat_intervals.raster.blocks import BLOCK, codec_versions, compressed, factors, halved
 from sat_intervals.raster.cog import Part, assemble, template
 from sat_intervals.raster.streaming import Stream
 
@@ -34,9 +34,10 @@ def parts_of(bands: np.ndarray, file: File, order: random.Random | None = None) 
     places = [(k, row) for k, f in enumerate(levels) for row in range(0, -(-bands.shape[1] // f), BLOCK)]
     if order:
         order.shuffle(places)
-    made = {}
+    made, of_levels = {}, [bands]
+    of_levels += [bands := halved(bands) for _ in levels[1:]]
     for k, row in places:
-        rows = compressed(bands[:, :: levels[k], :: levels[k]][:, row : row + BLOCK], file)
+        rows = compressed(of_levels[k][:, row : row + BLOCK], file)
         made[k, row] = Part(rows.sizes, rows.content)
     return [[made[place] for place in sorted(made) if place[0] == k] for k in range(len(levels))]
 
@@ -77,15 +78,23 @@ def test_assemble__is_a_valid_file_with_every_level(tmp_path, monkeypatch, file,
     write(path, bands, file)
     assert path.read_bytes()[2] == (43 if is_big else 42)
     assert_valid(path)
-    for level, factor in enumerate(factors(*shape)):
+    for level in range(len(factors(*shape))):
         options = {"overview_level": level - 1} if level else {}
+        bands = halved(bands) if level else bands
         with rasterio.open(path, **options) as dataset:
-            np.testing.assert_array_equal(dataset.read(), bands[:, ::factor, ::factor])
+            np.testing.assert_array_equal(dataset.read(), bands)
             assert dataset.block_shapes[0] == (BLOCK, BLOCK)
             np.testing.assert_equal(dataset.nodata, file.nodata)
     with rasterio.open(path) as dataset:
         assert (dataset.tags()["ALPHA"], dataset.tags(1)["meaning"]) == ("0.9", file.bands[0].meaning)
         assert Georeferencing.of(dataset) == PLACE
+
+
+def test_halved__is_the_mean_of_what_is_known_and_every_other_flag():
+    values = np.array([[1, 2, np.nan], [5, 4, np.nan], [np.nan, 7, 8]], np.float32)
+    np.testing.assert_array_equal(halved(values[np.newaxis])[0], [[3, np.nan], [7, 8]])
+    flags = np.arange(15, dtype=np.uint16).reshape(1, 3, 5)
+    np.testing.assert_array_equal(halved(flags), flags[:, ::2, ::2])
 
 
 def test_assemble__with_zstd(tmp_path):

@@ -110,3 +110,17 @@ def test_height_raster__refuses_bands_in_feet(tmp_path, unit, is_metre):
         return
     with pytest.raises(SatIntervalsError, match=f"a.tif has heights in {unit}: convert them to metres"):
         HeightRaster(path, None, ELLIPSOID)
+
+
+@pytest.mark.parametrize(
+    ("value", "share", "warns"), [(-32.0, 0.04, True), (-32.0, 0.0005, False), (430.0, 0.04, False)]
+)
+def test_warn_of_no_data__names_a_value_far_from_all_others(tmp_path, caplog, value, share, warns):
+    heights = np.random.default_rng(3).normal(440, 15, (90, 110)).astype(np.float32)
+    heights.ravel()[: int(share * heights.size)] = value
+    HeightRaster(write(tmp_path / "a.tif", heights), None, ELLIPSOID)
+    assert (f"are exactly {value:g}, " in caplog.text) == warns
+    assert ("gdal_edit.py -a_nodata -32" in caplog.text) == warns
+    caplog.clear()
+    HeightRaster(write(tmp_path / "b.tif", heights, nodata=value), None, ELLIPSOID)
+    assert not caplog.text

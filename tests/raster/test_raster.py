@@ -41,7 +41,9 @@ from sat_intervals.raster import (
     read_window,
     surface_file,
 )
+from sat_intervals.raster.georeferencing import horizontal_name
 from sat_intervals.raster.identity import local_file
+from sat_intervals.raster.projection import utm_of
 from sat_intervals.raster.windows import kept_view, restored_view
 from sat_intervals.tiling import View, Window
 
@@ -176,10 +178,10 @@ def test_open_image__refuses_what_is_no_image(tmp_path, name):
 
 REFUSED = {
     "complex": (np.ones((3, 4), np.complex64), {}, {}, ("complex64", "amplitude")),
-    "several bands": (np.stack([RAMP, RAMP, RAMP]), {}, {}, ("3 bands", "1 to 3", "--band")),
+    "several bands": (np.stack([RAMP, RAMP, RAMP]), {}, {}, ("bands 1 to 3", "--band")),
     "band below": (RAMP, {}, {"band": 0}, ("no image band 0", "band 1 only")),
     "band above": (RAMP, {}, {"band": 2}, ("no image band 2", "band 1 only")),
-    "alpha band": (np.stack([RAMP, RAMP]), {"alpha": 2}, {"band": 2}, ("no image band 2", "band 1 only")),
+    "alpha band": (np.stack([RAMP, RAMP]), {"alpha": 2}, {"band": 3}, ("no image band 3", "band 1 only (band 2 is")),
     "alpha alone": (RAMP, {"alpha": 1}, {}, ("no image band",)),
 }
 
@@ -709,3 +711,36 @@ def test_output_writer__leaves_nothing_on_a_full_disk(disk, products, size, othe
         fill()
     message(failure, place / "out", reason, "choose another folder")
     assert set(left_behind(place)) <= {"other", "out"}
+
+
+# ---- Colours and CRS ---------------------------------------------------------------------------------------------
+def test_open_image__says_that_a_fourth_band_is_read_as_alpha_and_takes_it_by_its_number(tmp_path, caplog):
+    bands = np.stack([RAMP, RAMP + 1, RAMP + 2, np.where(RAMP.min() < RAMP, RAMP, 0)])
+    path = make(tmp_path / "rgbn.tif", bands, alpha=4)
+    with pytest.raises(InputError, match=r"has bands 1 to 3 \(band 4 is read as alpha\): choose one with --band"):
+        open_image(path)
+    assert open_image(path, band=2).alpha == 4
+    assert "band 4 is read as alpha, 0 is no data: if it is an image band" in caplog.text
+    infrared = open_image(path, band=4)
+    pixels, state = read_window(infrared, Window(0, 0, *RAMP.shape))
+    assert (infrared.alpha, state.any()) == (None, False)
+    np.testing.assert_array_equal(pixels, bands[3])
+
+
+def test_check_pair__takes_crs_that_differ_only_in_their_heights(tmp_path):
+    images = [
+        open_image(make(tmp_path / f"{number}.tif", RAMP, crs=crs, transform=Affine(2, 0, 0, 0, -2, 0)))
+        for number, crs in enumerate(["EPSG:32633", "EPSG:32633+5773", "EPSG:32634"])
+    ]
+    check_pair(images[0], images[1], 1)
+    with pytest.raises(InputError, match="different CRS"):
+        check_pair(images[0], images[2], 1)
+
+
+def test_horizontal_name__is_the_code_of_a_compound_crs():
+    assert horizontal_name(rasterio.crs.CRS.from_user_input("EPSG:32719+5773")) == "EPSG:32719"
+
+
+@pytest.mark.parametrize(("place", "code"), [((10.0, 86.0), 32661), ((-120.0, -85.2), 32761), ((-70.1, -33.0), 32719)])
+def test_utm_of__has_a_map_for_every_place(place, code):
+    assert utm_of(*place) == f"EPSG:{code}"

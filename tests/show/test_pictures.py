@@ -85,7 +85,7 @@ def test_plot__makes_every_picture_and_names_it(run):
     arguments = ["plot", str(run), "--row", "60", "--columns", "20", "150", "--pixel", "60", "90", "--dpi", "50"]
     done = invoke(*arguments)
     assert done.exit_code == 0, done.output
-    names = ["overview.png", "errors.png", "coverage.png", "profile.png", "curve.png"]
+    names = ["overview.png", "errors.png", "profile.png", "curve.png"]
     assert done.output.split() == [str(run / name) for name in names]
     for name in names:
         picture = pixels_of(run / name)
@@ -304,14 +304,14 @@ def test_plot__draws_no_surface_of_an_earlier_run_and_none_that_is_no_surface(tm
     done = invoke("plot", out, "--dpi", "40")
     assert done.exit_code == 0, done.output
     said = f"{out / 'dsm.tif'} is of another run and is left out: rerun sat-intervals dsm\n"
-    assert done.stderr == f"sat-intervals: {said}"
+    assert done.stderr == f"warning: {said}"
     assert not (out / "dsm.png").exists()
     shutil.copy(out / "validity.tif", tmp_path / "dsm.tif")
     with pytest.raises(SatIntervalsError, match=r"dsm\.tif is not a surface model of sat-intervals dsm"):
         draw_surface(tmp_path / "dsm.tif", tmp_path / "dsm.png")
 
 
-@pytest.mark.parametrize("name", ["overview.png", "coverage.png"])
+@pytest.mark.parametrize("name", ["overview.png", "errors.png"])
 def test_plot__keeps_the_mask_that_it_is_given(run, name):
     mask = run / name
     assert invoke("plot", run, "--dpi", "40").exit_code == 0

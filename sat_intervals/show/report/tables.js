@@ -22,6 +22,17 @@ function showHeadline() {
   );
 }
 
+function showVerdict() {
+  find("verdict").textContent = run.verdict;
+  find("warnings").append(...run.warnings.map((line) => element("li", {}, line)));
+}
+
+function showSurface() {
+  if (!contents.surface) return;
+  find("surface").hidden = false;
+  find("surface").append(table(["", ""], Object.entries(contents.surface)));
+}
+
 /** Draw histograms of two classes of pixels on a logarithmic axis, with a table of their counts. */
 function showHistogram(place, { step, bars }, kinds, names) {
   const total = kinds.reduce((sum, [name]) => sum + bars[name].reduce((all, count) => all + count, 0), 0);
@@ -116,7 +127,7 @@ function showValidity() {
 
 function showSearch() {
   const { valid, range_ends: ends } = run.counts;
-  const { search: found, local_ranges: local, quality, warnings } = run;
+  const { search: found, local_ranges: local, quality } = run;
   const place = find("search");
   const origin = found ? `found from matches on ${percent(found.matched)} of the pixels` : "given";
   place.append(element("p", {}, `Disparities ${short(search.minimum)} to ${short(search.maximum)} px, ${origin}` +
@@ -126,7 +137,6 @@ function showSearch() {
     ["distance of matches, 1 = random pixels", quality.noise === null ? "none" : fixed(quality.noise, 2)],
     ["rows of the two images", run.survey?.rows ? rowsSentence(run.survey.rows) : "not compared"],
     ...Object.entries(quality.collars).map(([side, collar]) => [`border of the ${side} image`, `${percent(collar.share)} of its pixels are ${short(collar.value)}`]),
-    ...warnings.map((line) => ["warning", line]),
   ];
   place.append(table([], rows));
   if (run.survey?.rows) showRows(place, run.survey.rows);
@@ -223,8 +233,10 @@ explore().catch((error) => {
   throw error;
 });
 showHeadline();
+showVerdict();
 showHistograms();
 showEvaluation();
+showSurface();
 showValidity();
 showSearch();
 showTiles();

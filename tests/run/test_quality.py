@@ -1,0 +1,117 @@
+"""What is odd about a pair: each cause is named once, the likeliest first."""
+
+import json
+
+import numpy as np
+import pytest
+import rasterio
+from helpers import PLACE, invoke, write_pair
+
+from sat_intervals import SatIntervalsError, load_config, match_pair
+from sat_intervals.demo import make_scene
+from sat_intervals.raster import open_image, write_layer
+from sat_intervals.run.quality import verdict_of
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene(260, 330, seed=17)
+
+
+def lows(scene, folder, side):
+    """A side of the pair whose smallest value is that of its collar."""
+    pixels = getattr(scene, side).astype(np.uint16) + 2000
+    pixels[:, :55] = 777
+    write_layer(folder / f"{side}.tif", pixels, None, PLACE)
+    return folder / f"{side}.tif"
+
+
+def test_warnings_of__no_data_is_the_one_diagnosis(scene, tmp_path):
+    images = [lows(scene, tmp_path, side) for side in ("left", "right")]
+    report = match_pair(*images, tmp_path / "out")
+    assert [line.split(": ")[1][:30] for line in report["warnings"]] == [
+        "17 % of the pixels are exactly", "17 % of the pixels are exactly",
+    ]  # fmt: skip
+    assert all(line.endswith("if it is no data, give --nodata 777") for line in report["warnings"])
+    assert "but see the warnings, the first one first" in report["verdict"]
+    given = match_pair(*[open_image(image, nodata=777) for image in images], tmp_path / "given")
+    assert given["warnings"] == []
+    assert given["counts"]["valid"] < report["counts"]["valid"]
+
+
+def test_warnings_of__a_value_that_no_pixel_has(scene, tmp_path):
+    write_pair(tmp_path, scene)
+    images = tmp_path / "left.tif", tmp_path / "right.tif"
+    shifted = []
+    for image in images:
+        with rasterio.open(image) as file:
+            pixels = file.read(1)
+        shifted.append(tmp_path / f"all_{image.name}")
+        write_layer(shifted[-1], np.maximum(pixels, 100), None, PLACE)
+    search = "--disparity", scene.minimum, scene.maximum
+    result = invoke("match", *shifted, tmp_path / "out", *search, "--nodata", 43)
+    (left, right) = (line for line in result.stderr.splitlines() if line.startswith("warning: "))
+    assert "all_left.tif: no pixel that was read is 43, the no-data value given: check --nodata" in left
+    assert "all_right.tif" in right
+    assert "warning" not in invoke("match", *shifted, tmp_path / "with", *search, "--nodata", 100).stderr
+
+
+def test_match__prints_the_verdict_and_then_the_warnings(scene, tmp_path):
+    images = [lows(scene, tmp_path, side) for side in ("left", "right")]
+    result = invoke("match", *images, tmp_path / "out", "--disparity", scene.minimum, scene.maximum)
+    lines = result.output.splitlines()
+    verdict = next(number for number, line in enumerate(lines) if "% valid, but see the warnings" in line)
+    warned = [number for number, line in enumerate(lines) if line.startswith("warning: ")]
+    time = next(number for number, line in enumerate(lines) if line.startswith("time"))
+    assert time < verdict < min(warned)
+    assert len(warned) == 2
+    assert len([line for line in lines if line.startswith("matching tiles")]) == 1
+
+
+def test_warnings_of__the_same_image_twice(scene, tmp_path):
+    write_pair(tmp_path, scene)
+    (tmp_path / "copy.tif").write_bytes((tmp_path / "left.tif").read_bytes())
+    report = match_pair(tmp_path / "left.tif", tmp_path / "copy.tif", tmp_path / "out")
+    assert report["warnings"][0].endswith("are the same image: give the left and the right one")
+
+
+@pytest.mark.parametrize("search", [(-180, -110), (90, 150), (-120, -60)])
+def test_match__a_range_beside_the_truth_is_refused_or_the_one_diagnosis(tmp_path, search):
+    write_pair(tmp_path, make_scene(300, 460, seed=4))
+    images = tmp_path / "left.tif", tmp_path / "right.tif"
+    result = invoke("match", *images, tmp_path / "out", "--disparity", *search, "--quiet")
+    (line,) = result.stderr.splitlines()
+    assert "leave out the search range" in line
+    assert result.exit_code == (2 if "not an epipolar pair" in line else 0)
+
+
+def test_prepare__refuses_an_unrelated_image(tmp_path):
+    for side, seed in (("left", 1), ("right", 2)):
+        pixels = getattr(make_scene(300, 420, seed=seed), side)
+        write_layer(tmp_path / f"{side}.tif", pixels, 0, PLACE)
+    search = {"disparity": {"minimum": -30, "maximum": 40}}
+    with pytest.raises(SatIntervalsError, match="check that both images show the same place"):
+        match_pair(tmp_path / "left.tif", tmp_path / "right.tif", tmp_path / "out", search)
+
+
+def test_verdict_of__compares_widths_with_those_of_the_calibration():
+    config = load_config({"interval": {"coverage": 0.9}, "disparity": {"minimum": -9, "maximum": 9}})
+    counts = {"valid": 90, "pixels": 100, "median_interval_width": 1.1}
+    assert verdict_of(counts, config, []) == "90 % valid, intervals usual for this preset"
+    wide = verdict_of(counts | {"median_interval_width": 9.0}, config, [])
+    assert wide.startswith("90 % valid, intervals wider than usual: median 9.00 px, ")
+    assert verdict_of(counts, config, ["one"]) == "90 % valid, but see the warning"
+    plain = load_config({"interval": {"alpha": 0.9}, "preset": "paper"})
+    assert verdict_of(counts, plain, []) == "90 % valid, nothing unusual"
+
+
+def test_batch__has_a_column_of_warnings(scene, tmp_path):
+    for side in ("left", "right"):
+        lows(scene, tmp_path, side)
+    text = f"name,left,right,minimum,maximum\none,left.tif,right.tif,{scene.minimum},{scene.maximum}\n"
+    (tmp_path / "pairs.csv").write_text(text)
+    result = invoke("batch", tmp_path / "pairs.csv", tmp_path / "out")
+    (row,) = [line.split() for line in result.stdout.splitlines() if line.startswith("one ")]
+    assert row[-1] == "2"
+    assert result.stderr.count("warning: ") == 2
+    assert len(json.loads((tmp_path / "out" / "batch.json").read_text())["one"]["warnings"]) == 2
