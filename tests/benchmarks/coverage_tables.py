@@ -1,4 +1,4 @@
-"""The tables of docs/coverage.md (`make coverage`), on the pairs of ``SAT_INTERVALS_SHARED``.
+"""The table of docs/coverage.md and more coverages (`make coverage`), on the pairs of ``SAT_INTERVALS_SHARED``.
 
 Every scene is matched with a calibration that was made without it, and compared with alpha 0.9. Fast cross-checking,
 valid pixels. On WorldView-3 the bias is removed, and a truth within 1 px of an interval counts as inside. Scenes are

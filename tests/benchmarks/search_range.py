@@ -1,4 +1,4 @@
-"""The tables of docs/range.md: found ranges and local ranges on the pairs of ``SAT_INTERVALS_SHARED``."""
+"""The figures of docs/range.md: found ranges and local ranges on the pairs of ``SAT_INTERVALS_SHARED``."""
 
 import json
 import os
