@@ -39,6 +39,12 @@ _CELL_OPTIONS = (
         "their intervals (default for others).",
     ),
     click.option(
+        "--keep-border",
+        "keeps_border",
+        is_flag=True,
+        help="Keep points of confidence below 0.1 beside missing data of the right image.",
+    ),
+    click.option(
         "--keep-open/--drop-open",
         "keeps_open",
         default=None,
@@ -64,7 +70,7 @@ def cell_options(command: Command) -> Command:
 
     @wraps(command)
     def with_cells(**given: Any) -> Any:
-        of_choices = ("bounds", "keeps_open", "outliers", "max_width", "min_confidence")
+        of_choices = ("bounds", "keeps_open", "keeps_border", "outliers", "max_width", "min_confidence")
         choices = {name: given.pop(name) for name in of_choices}
         calibration = given.pop("height_calibration")
         cells = {name: given.pop(name) for name in ("resolution", "crs", "radius", "geoid")}
@@ -109,7 +115,7 @@ def say_surface(console: "Console", report: dict[str, Any]) -> None:
     for name, what in (
         ("outliers", "points left out as outliers"),
         ("open", "points left out, with intervals open at an end of the search range"),
-        ("border", "points left out, beside missing data of the right image and without confidence"),
+        ("border", "points left out, beside missing data of the right image and of confidence below 0.1"),
         ("poor_cells", "cells left out for their width or confidence"),
     ):
         if report[name]:

@@ -22,6 +22,8 @@ class SurfaceChoices:
         and contains the cell's height. None: ``median`` for runs with a coverage, else ``envelope``.
     keeps_open
         Whether points whose interval is open at an end of the search range contribute. None: not with a coverage.
+    keeps_border
+        Whether points beside missing data of the right image contribute whose confidence is below 0.1.
     outliers, max_width
         Metres: leave out points farther from the median of the points within 2 pixels, and cells with a wider interval.
     min_confidence
@@ -32,6 +34,7 @@ class SurfaceChoices:
 
     bounds: Bounds | None = None
     keeps_open: bool | None = None
+    keeps_border: bool = False
     outliers: float | None = None
     max_width: float | None = None
     min_confidence: float | None = None

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.heights.lattice import between_180
 from sat_intervals.heights.sensors import Sensors
 from sat_intervals.raster import Projection
 
@@ -24,6 +25,7 @@ class Location:
     """Positions of ground points in both epipolar images."""
 
     def __init__(self, sensors: Sensors) -> None:
+        self._turn = sensors.turn
         self._views = (
             (sensors.left_model, _Inverse(sensors.left_grid)),
             (sensors.right_model, _Inverse(sensors.right_grid)),
@@ -35,6 +37,8 @@ class Location:
         Degrees (WGS 84) and metres above its ellipsoid; pixel centres are integers.
         """
         found = []
+        if self._turn:
+            longitude = between_180(longitude - self._turn)
         for model, grid in self._views:
             with warnings.catch_warnings(action="ignore"):
                 row, column, _ = model.inverse_loc(longitude, latitude, height)

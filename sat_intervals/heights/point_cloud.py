@@ -24,6 +24,8 @@ from sat_intervals.tiling import Grid, Tile, Window
 _NEAR = 2
 # Metres from the median of the points near it at which a point does not widen the surface.
 _FAR = 20.0
+# Confidence below which points beside missing data of the right image are left out.
+_DOUBTFUL = 0.1
 # The height among the values of a lattice.
 _HEIGHT = slice(2, 3)
 
@@ -141,10 +143,10 @@ class PointCloud:
         if not self._choices.keeps_open:
             left_out["open"] = np.isfinite(height) & (bands.validity & np.uint16(OPEN_BELOW | OPEN_ABOVE) != 0)
             height[left_out["open"]] = np.nan
-        # beside missing data of the right image only wrong candidates may be left
-        is_doubtful = (bands.validity & np.uint16(RANGE_INCOMPLETE) != 0) & (bands.confidence == 0)
-        left_out["border"] = np.isfinite(height) & is_doubtful
-        height[left_out["border"]] = np.nan
+        if not self._choices.keeps_border:  # only wrong candidates may be left there
+            is_doubtful = (bands.validity & np.uint16(RANGE_INCOMPLETE) != 0) & (bands.confidence < _DOUBTFUL)
+            left_out["border"] = np.isfinite(height) & is_doubtful
+            height[left_out["border"]] = np.nan
         return places, left_out
 
     def _outlying(self, window: Window, limit: float) -> np.ndarray:

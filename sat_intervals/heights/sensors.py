@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError, check_file
-from sat_intervals.heights.lattice import Lattice
+from sat_intervals.heights.lattice import Lattice, between_180
 from sat_intervals.kernels.compiled import kernels_of_others
 from sat_intervals.kernels.rows import RowOffsets
 from sat_intervals.progress import Progress
@@ -33,6 +34,8 @@ _SPACING = 32
 _AT_ONCE = 100_000
 # Positions along rows and columns of a region, to check models and grids.
 _CHECKED = 9
+# Degrees of longitude from the 180th meridian: models nearer to it are turned.
+_NEAR_180 = 2.0
 # Metres: lines of sight of one scene meet within centimetres, those of two scenes miss by hundreds of metres.
 _FOREIGN_RESIDUAL = 10.0
 
@@ -45,6 +48,7 @@ class Sensors:
     right_model: Any
     left_grid: RectificationGrid
     right_grid: RectificationGrid
+    turn: float = 0.0  # degrees of longitude by which the models are turned, away from the 180th meridian
     rows: RowOffsets | None = None  # by which matched right rows are lower than those of the right grid
 
     @classmethod
@@ -61,13 +65,15 @@ class Sensors:
         """Read RPC models (GeoTIFF tags, ``.geom``, DIMAP XML) and epipolar grids, see `grids.read_grid`."""
         model = partial(_read, kind="RPC model", reader=GeoModel)
         grid = partial(_read, kind="epipolar grid", reader=partial(read_grid, left=left or Georeferencing()))
-        return cls(model(left_model), model(right_model), grid(left_grid), grid(right_grid), rows)
+        models = model(left_model), model(right_model)
+        return cls(*models, grid(left_grid), grid(right_grid), _turned(models), rows)
 
     def triangulate(self, row: np.ndarray, column: np.ndarray, disparity: np.ndarray) -> np.ndarray:
         """Return ``(n, 4)`` longitude, latitude, height and residual of epipolar positions ``(n,)``.
 
-        Degrees (WGS 84), metres above its ellipsoid, and metres from the point to either line of sight. Pixel centres
-        are integers; the right pixel is at ``column + disparity`` of the same row, or of the one that was matched.
+        Degrees (WGS 84; longitudes are continuous across 180), metres above its ellipsoid, and metres from the point to
+        either line of sight. Pixel centres are integers; the right pixel is at ``column + disparity`` of the same row,
+        or of the one that was matched.
         """
         right = column + disparity
         lower = self.rows.at(row, right) if self.rows else 0.0
@@ -82,7 +88,20 @@ class Sensors:
                 _, points, residuals = epipolar_triangulation(matches, None, "sift", *sensors, residues=True)
         except SystemError as error:  # numba's word for an interrupt
             raise error.__cause__ or error from None
-        return np.column_stack([points, np.max(residuals, axis=1)])
+        return np.column_stack([points[:, 0] + self.turn, points[:, 1:], np.max(residuals, axis=1)])
+
+
+def _turned(models: Sequence[Any]) -> float:
+    """Turn models near the 180th meridian to longitude 0 and return by how much: shareloc has longitudes up to 180.
+
+    Turning about the Earth's axis changes neither heights nor distances.
+    """
+    turn = float(models[0].offset_x)
+    if 180 - abs(turn) > _NEAR_180:
+        return 0.0
+    for model in models:
+        model.offset_x = between_180(model.offset_x - turn)
+    return turn
 
 
 def _read(path: Path, kind: str, reader: Any) -> Any:
@@ -163,8 +182,7 @@ def median_residual(sensors: Sensors, region: Window, minimum: int, maximum: int
     if 2 * len(points) < places[0].size:
         raise SatIntervalsError(
             f"shareloc finds no point for {places[0].size - len(points)} of {places[0].size} lines of sight: check "
-            "which model and which grid belong to the left and the right image; shareloc does not support scenes "
-            "across the 180th meridian"
+            "which model and which grid belong to the left and the right image"
         )
     residual, height = float(np.median(points[:, 3])), float(np.median(points[:, 2]))
     if not (residual <= _FOREIGN_RESIDUAL and GROUND[0] <= height <= GROUND[1]):

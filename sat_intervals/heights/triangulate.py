@@ -10,7 +10,7 @@ import numpy as np
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.geometry import FILE, geometry_of
-from sat_intervals.heights.lattice import WINDOW, Lattice, on_map
+from sat_intervals.heights.lattice import WINDOW, Lattice, between_180, on_map
 from sat_intervals.heights.point_cloud import PointCloud
 from sat_intervals.products import Bands
 from sat_intervals.progress import Progress
@@ -93,7 +93,7 @@ def _write_las(run: Run, lattice: Lattice, path: Path, tally: "_Tally", progress
     for name, meaning in (("lower", "height bound, metres"), ("upper", "height bound, metres"), ("confidence", "")):
         header.add_extra_dim(laspy.ExtraBytesParams(name, "float32", meaning))
     left = Layer(open_input(run.report["inputs"]["left"]), run.region.row, run.region.column)
-    cloud = PointCloud(run, lattice, SurfaceChoices(keeps_open=True))
+    cloud = PointCloud(run, lattice, SurfaceChoices(keeps_open=True, keeps_border=True))
     kind = {"header": header, "do_compress": path.suffix.lower() == ".laz"}
     with new_file(path) as temporary, _disk_errors(), laspy.open(temporary, "w", **kind) as file:
         for tile in Grid(Window(0, 0, *run.shape), WINDOW):
@@ -154,6 +154,8 @@ def _layers(lattice: Lattice, window: Window, disparities: np.ndarray) -> np.nda
     middle, one, other = (lattice.points(window, disparity) for disparity in disparities)
     # Which bound gives the higher point depends on the geometry of the pair.
     low, high = np.where(one[2] > other[2], [other, one], [one, other])
+    for points in (middle, low, high):
+        points[0] = between_180(points[0])
     return np.stack(
         [
             *_rounded(middle[:2], _DEGREES),

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import os
 from collections.abc import Iterator
 from contextlib import suppress
@@ -90,10 +91,35 @@ def _item(run: Run, times: dict[str, str | None], identifier: str) -> dict[str, 
     }
     if corners:
         around = [[round(value, _DIGITS) for value in corner] for corner in corners]
-        longitudes, latitudes = zip(*around, strict=True)
-        item["geometry"] = {"type": "Polygon", "coordinates": [[*around, around[0]]]}
-        item["bbox"] = [min(longitudes), min(latitudes), max(longitudes), max(latitudes)]
+        item |= _place(around)
     return item
+
+
+def _place(around: list[list[float]]) -> dict[str, Any]:
+    """Return geometry and box of corners; GeoJSON (RFC 7946, 3.1.9) cuts what the 180th meridian crosses."""
+    longitudes, latitudes = zip(*around, strict=True)
+    ends = min(latitudes), max(latitudes)
+    if min(longitudes) >= -180 and max(longitudes) <= 180:
+        geometry = {"type": "Polygon", "coordinates": [[*around, around[0]]]}
+        return {"geometry": geometry, "bbox": [min(longitudes), ends[0], max(longitudes), ends[1]]}
+    edge = math.copysign(180, max(longitudes) + min(longitudes))
+    west, east = _cut(around, edge, 1), _cut(around, edge, -1)
+    beyond, shift = (east, -360) if edge > 0 else (west, 360)
+    beyond[:] = [[round(longitude + shift, _DIGITS), latitude] for longitude, latitude in beyond]
+    rings = [[[*part, part[0]]] for part in (west, east)]
+    box = [min(x for x, _ in west), ends[0], max(x for x, _ in east), ends[1]]
+    return {"geometry": {"type": "MultiPolygon", "coordinates": rings}, "bbox": box}
+
+
+def _cut(ring: list[list[float]], meridian: float, side: int) -> list[list[float]]:
+    """Return the part of a convex ring west (``side`` 1) or east (-1) of a meridian."""
+    kept: list[list[float]] = []
+    for (x, y), (u, v) in zip(ring, ring[1:] + ring[:1], strict=True):
+        if side * (meridian - x) >= 0:
+            kept.append([x, y])
+        if (meridian - x) * (meridian - u) < 0:
+            kept.append([meridian, round(y + (v - y) * (meridian - x) / (u - x), _DIGITS)])
+    return kept
 
 
 def _link(run: Run, side: str) -> dict[str, str]:

@@ -115,6 +115,8 @@ def horizontal_name(crs: CRS) -> str:
 def footprint(place: Georeferencing, shape: tuple[int, int]) -> Corners | None:
     """Return longitude and latitude (degrees, WGS 84) of four corners, counter-clockwise; None without georeferencing.
 
+    Longitudes are continuous across 180.
+
     Of an image with RPCs alone: the corners of the box for which they are valid, which is larger than the image.
     """
     height, width = shape
@@ -139,6 +141,8 @@ def footprint(place: Georeferencing, shape: tuple[int, int]) -> Corners | None:
     except ProjError:  # a local CRS has no place on the ground
         return None
     found = [to_degrees.transform(x, y) for x, y in corners]
+    first = found[0][0]
+    found = [(first + (longitude - first + 180) % 360 - 180, latitude) for longitude, latitude in found]
     area = sum(x * v - u * y for (x, y), (u, v) in zip(found, found[1:] + found[:1], strict=True))
     return found if area > 0 else found[::-1]
 

@@ -28,6 +28,7 @@ _LARGEST_UNDULATION = 120.0
 def utm_of(longitude: float, latitude: float) -> str:
     """Return the UTM zone of a place (degrees), such as ``EPSG:32637``, or the polar map of UPS."""
     area = AreaOfInterest(longitude, latitude, longitude, latitude)
+    longitude = (longitude + 180) % 360 - 180
     if abs(latitude) > _POLAR:
         return "EPSG:32661" if latitude > 0 else "EPSG:32761"
     zones = query_utm_crs_info(datum_name="WGS 84", area_of_interest=area)

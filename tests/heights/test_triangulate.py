@@ -138,12 +138,23 @@ def test_triangulate__orders_bounds_by_height(level_run):
     assert np.abs(points[BAND["height"]] - (DATUM - 1.0)).max() < 0.01
 
 
-def test_triangulate__says_what_shareloc_cannot_do(tmp_path):
+@pytest.mark.parametrize("middle", [180.0, -180.0])
+def test_triangulate__across_the_180th_meridian_is_as_elsewhere(tmp_path, middle):
     out = write_run(tmp_path, np.ones((4, 40, 50), np.float32), np.zeros((40, 50), np.uint16))
-    middle = on_the_ground(20, 25, DATUM)[0] - LONGITUDE
-    # its iterations run away there: what they end with, NaN or a division by zero, is a matter of the last bit
-    with pytest.raises(SatIntervalsError, match=r"scenes across the 180th meridian|cannot use .*: division"):
-        set_geometry(out, *cameras(tmp_path, 40, 50, longitude=180 - middle))
+    offset = on_the_ground(20, 25, DATUM)[0] - LONGITUDE
+    set_geometry(out, *cameras(tmp_path, 40, 50))
+    triangulate(out)
+    elsewhere = read(out / "points.tif")
+    set_geometry(out, *cameras(tmp_path, 40, 50, longitude=middle - offset))
+    triangulate(out)
+    points = read(out / "points.tif")
+    longitude = points[BAND["longitude"]]
+    assert (np.abs(longitude) <= 180).all()
+    assert {-1.0, 1.0} == set(np.sign(longitude.ravel()))
+    east = (longitude - middle + 180) % 360 - 180
+    assert np.abs(east - (elsewhere[BAND["longitude"]] - LONGITUDE - offset)).max() < 1e-8
+    for name in ("latitude", "height", "height_lower", "residual"):
+        assert np.abs(points[BAND[name]] - elsewhere[BAND[name]]).max() < 1e-5
 
 
 @pytest.fixture(scope="module")

@@ -101,6 +101,21 @@ def test_write_item__without_georeferencing_and_valid_pixels(tmp_path, monkeypat
     assert item["assets"]["intervals"]["bands"][0]["statistics"] == {"valid_percent": 0}
 
 
+def test_write_item__cuts_a_place_at_the_180th_meridian(tmp_path, monkeypatch):
+    monkeypatch.setattr("finished.PLACE", north_up(32601, 166_000, 100, 10))  # 180 is at 166 021 m
+    out = write_run(tmp_path, *random_bands(8, 12)[:2])
+    assert invoke("stac", out).exit_code == 0
+    item = json.loads((out / "stac.json").read_text())
+    west, south, east, north = item["bbox"]
+    assert (item["geometry"]["type"], south < north) == ("MultiPolygon", True)
+    assert west == pytest.approx(179.99981, abs=2e-5)
+    assert east == pytest.approx(-179.99912, abs=2e-5)
+    rings = [np.array(polygon[0]) for polygon in item["geometry"]["coordinates"]]
+    assert [(ring[:, 0].min() > 0, np.abs(ring[:, 0]).max()) for ring in rings] == [(True, 180), (False, 180)]
+    for x, y in ((ring - ring[0]).T for ring in rings):
+        assert (x[:-1] * y[1:] - x[1:] * y[:-1]).sum() > 0  # counter-clockwise
+
+
 def test_footprint__of_a_local_crs_is_none():
     local = rasterio.crs.CRS.from_wkt('LOCAL_CS["epipolar",UNIT["metre",1]]')
     assert footprint(Georeferencing(crs=local, transform=rasterio.Affine(0.5, 0, 0, 0, -0.5, 0)), (10, 20)) is None
