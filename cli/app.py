@@ -35,8 +35,7 @@ from sat_intervals.cli.triangulate import triangulate
 
 FAILED, USER_ERROR = 1, 2
 # Packages of extras.
-_EXTRAS = {"matplotlib": "plot", "shareloc": "dsm", "scipy": "dsm", "onnxruntime": "mccnn", "dask_jobqueue": "cluster"}
-_EXTRAS |= dict.fromkeys(("laspy", "pyogrio", "shapely"), "reference")
+_EXTRAS = {"matplotlib": "plot", "scipy": "dsm", "pyogrio": "reference", "shapely": "reference"}
 _ITEM = "\n  "
 RESUMED = ("match", "demo", "batch", "surface")
 STEPS: dict[str, tuple[click.Command, ...]] = {

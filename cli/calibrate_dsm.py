@@ -63,7 +63,6 @@ def _show(calibration: "HeightCalibration") -> None:
     if found["shift"] is not None:
         east, north, up = found["shift"]
         click.echo(f"reference moved: easting {east:+.2f} m, northing {north:+.2f} m, height {up:+.2f} m")
-    warn(found["warnings"])
     keys = {
         "coverage": "coverage",
         "lowest": "lowest",
@@ -75,3 +74,4 @@ def _show(calibration: "HeightCalibration") -> None:
         [name, *("-" if one.get(key) is None else f"{one[key]:.3f}" for key in keys)] for name, one in figures.items()
     ]
     show(["", *keys.values()], rows, "coverage and widths: before, and expected on ground that was held out")
+    warn(found["warnings"])

@@ -154,7 +154,7 @@ class Console:
                 row += ["", ""]
             table.add_row(*row, str(len(end.get("warnings", ()))) if counts else "")
         self._terminal.print(table)
-        warn(line for end in report.values() for line in end.get("warnings", ()))
+        warn(f"{name}: {line}" for name, end in report.items() for line in end.get("warnings", ()))
 
 
 def _share(part: int, whole: int) -> str:

@@ -76,17 +76,18 @@ def evaluate(
             click.echo(f"matching {source.name}", err=True)
         report = _evaluated(source, config, tolerance=judging.tolerance, remove_bias=remove_bias)
         scenes.append(SceneMetrics(source.name, group or _group(source), report))
-    names = [scene.name for scene in scenes if scene.report["truth_is_whole"]]
-    if not judging.quiet:
-        warn(_biased(scene) for scene in scenes if abs(scene.report["median_error"] or 0.0) > _BIAS)
-        if names and not judging.tolerance:  # such a truth may be wrong by half a pixel
-            warn([f"the truth of {', '.join(names)} has whole pixels only: try --tolerance 0.5"])
     if judging.as_json:
         say_scenes(scenes)
     elif len(scenes) == 1:
         show_scene(scenes[0])
     else:
         show_scenes(scenes)
+    if not judging.quiet:
+        biased = [scene for scene in scenes if abs(scene.report["median_error"] or 0.0) > _BIAS]
+        warn(map(_biased, biased))
+        names = [scene.name for scene in scenes if scene.report["truth_is_whole"] and scene not in biased]
+        if names and not judging.tolerance:  # such a truth may be wrong by half a pixel
+            warn([f"the truth of {', '.join(names)} has whole pixels only: try --tolerance 0.5"])
 
 
 def _biased(scene: "SceneMetrics") -> str:

@@ -10,9 +10,9 @@ from typing import IO
 import click
 
 from sat_intervals.cli.signals import Ended
+from sat_intervals.progress import REPORT
 
 _LOG = logging.getLogger(__name__)
-REPORT = "sat_intervals.report"  # logger of the warnings of a run, which `Console.summary` prints
 _LINES = logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s")
 
 
@@ -63,10 +63,11 @@ def logged(debug: bool, log_file: Path | None) -> Iterator[None]:
         everything = [_Handler(_LINES, stack.enter_context(_opened(log_file)))] if log_file else []
         if debug:
             everything.append(_Handler(_LINES))
+            everything[-1].addFilter(_is_of_no_report)
         else:
             warnings = _Handler(_Warnings())
             warnings.setLevel(logging.WARNING)
-            warnings.addFilter(lambda record: record.name != REPORT)
+            warnings.addFilter(_is_of_no_report)
             stack.enter_context(_added(warnings, ours))
         # dask's logger gets a handler of its own and does not propagate, unless the root logger already has handlers
         dasks = logging.getLogger("distributed")
@@ -91,6 +92,10 @@ def logged(debug: bool, log_file: Path | None) -> Iterator[None]:
             _LOG.debug("%s failed", name, exc_info=error)
             raise
         _LOG.info("%s ended after %.1f s", name, time.monotonic() - began)
+
+
+def _is_of_no_report(record: logging.LogRecord) -> bool:
+    return record.name != REPORT
 
 
 @contextmanager

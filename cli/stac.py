@@ -9,7 +9,7 @@ from sat_intervals.cli.options import FILE, log_options
 
 @click.command(short_help="Write a STAC item of a finished run.")
 @click.argument("out", type=FILE)
-@click.option("--datetime", "taken", metavar="TIME", help="When the left image was taken; default: the end of the run.")
+@click.option("--datetime", "taken", metavar="TIME", help="When the left image was taken; default: its TIFF tags.")
 @click.option("--id", "identifier", metavar="ID", help="Identifier of the item; default: the name of the folder.")
 @log_options
 def stac(out: Path, taken: str | None, identifier: str | None) -> None:

@@ -57,15 +57,15 @@ def show_scenes(scenes: Sequence[SceneMetrics]) -> None:
     _show_missed(scenes)
     paths = [
         ("nominal",), ("all", "accuracy"), ("high", "accuracy"), ("low", "accuracy"), ("all", "mean_width"),
-        ("all", "median_width"), ("all", "interval_score"),
+        ("all", "median_width"), ("all", "interval_score"), ("median_error",),
     ]  # fmt: skip
     figures = {scene.name: [look_up(scene.report, path) for path in paths] for scene in scenes}
     known = [[value for value in column if value is not None] for column in zip(*figures.values(), strict=True)]
     figures["mean"] = [sum(column) / len(column) if column else None for column in known]
     nominal = " or ".join(sorted({_NOMINAL[scene.report["nominal_is"]] for scene in scenes}, reverse=True))
-    header = ["", nominal, "coverage", "high", "low", "mean width", "median width", "score"]
+    header = ["", nominal, "coverage", "high", "low", "mean width", "median width", "score", "median error"]
     rows = [[name, *map(_figure, values)] for name, values in figures.items()]
-    show(header, rows, f"{nominal}, measured coverage, widths and interval score (px), valid pixels")
+    show(header, rows, f"{nominal}, measured coverage, widths, interval score and disparity - truth (px)")
 
 
 def _show_missed(scenes: Sequence[SceneMetrics]) -> None:
@@ -106,11 +106,11 @@ def show_scene(scene: SceneMetrics) -> None:
     ]
     if deciles:
         show(["confidence", "pixels", "coverage", "mean width (px)"], deciles, "by decile of confidence")
-    high, low = report["high"]["accuracy"], report["low"]["accuracy"]
-    if high is not None and low is not None and high < low:
+    high, low = report["high"], report["low"]
+    if high["count"] and low["count"] and high["accuracy"] < low["accuracy"]:
         click.echo(
-            "confident pixels are covered less often than doubtful ones: their intervals are about a pixel wide, so "
-            "errors of the truth and of sub-pixel disparities count, while doubtful intervals are wide"
+            "confident pixels are covered less often than doubtful ones: errors of the truth and of sub-pixel "
+            f"disparities count in intervals of {high['mean_width']:.2f} px, not in {low['mean_width']:.2f} px"
         )
 
 

@@ -135,7 +135,7 @@ class Results(Run):
         yield from ((window.row, self.read(window)) for window in self.windows())
 
     def read_small(self, shape: tuple[int, int]) -> Bands:
-        """Read all bands and the left image at ``shape`` pixels: bands subsampled, the image averaged; no truth."""
+        """Read all bands, from overviews, and the left image at ``shape`` pixels; no truth."""
         bands = Bands(*(band for name, n in _BANDS.items() for band in read_small_layers(self.out / name, shape)[:n]))
         return bands._replace(image=read_small_image(self.left, self.region, shape))
 

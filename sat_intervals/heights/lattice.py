@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,11 +13,6 @@ from sat_intervals.tiling import Grid, Window
 
 # Side of a window of pixels whose points are made at a time: a block of the files of a run.
 WINDOW = 512
-
-
-def between_180(longitude: Any) -> Any:
-    """Return longitudes as degrees from -180 to 180."""
-    return (longitude + 180) % 360 - 180
 
 
 class Extent(NamedTuple):

@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.heights.lattice import between_180
 from sat_intervals.heights.sensors import Sensors
-from sat_intervals.raster import Projection
+from sat_intervals.raster import Projection, between_180
 
 try:
     from scipy.interpolate import RegularGridInterpolator

@@ -22,8 +22,9 @@ from sat_intervals.tiling import Grid, Tile, Window
 
 # Pixels around a point whose median outliers are compared with.
 _NEAR = 2
-# Metres from the median of the points near it at which a point does not widen the surface.
-_FAR = 20.0
+# Points do not widen a surface that are fewer than this share of a window, or farther than so many metres, and than the
+# range of heights there, from all but the tails of the heights of their window.
+_FEW, _FAR, _TAIL = 1e-4, 20.0, 0.01
 # Confidence below which points beside missing data of the right image are left out.
 _DOUBTFUL = 0.1
 # The height among the values of a lattice.
@@ -92,8 +93,13 @@ class PointCloud:
 
     def _extent(self, window: Window) -> Extent | None:
         (x, y, height), _ = self._places(window, self.run.read_bands(window))
-        height[self._outlying(window, _FAR)] = np.nan
-        x, y = x[np.isfinite(height)], y[np.isfinite(height)]
+        known = np.isfinite(height)
+        if known.mean() < _FEW:
+            return None
+        low, high = np.quantile(height[known], (_TAIL, 1 - _TAIL))
+        margin = max(_FAR, high - low)
+        known &= (low - margin <= height) & (height <= high + margin)
+        x, y = x[known], y[known]
         return Extent(float(x.min()), float(y.min()), float(x.max()), float(y.max())) if x.size else None
 
     def splat(

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError, check_file
-from sat_intervals.heights.lattice import Lattice, between_180
+from sat_intervals.heights.lattice import Lattice
 from sat_intervals.kernels.compiled import kernels_of_others
 from sat_intervals.kernels.rows import RowOffsets
 from sat_intervals.progress import Progress
-from sat_intervals.raster import GROUND, Georeferencing
+from sat_intervals.raster import GROUND, Georeferencing, between_180
 from sat_intervals.tiling import Window
 
 try:

@@ -10,11 +10,11 @@ import numpy as np
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.geometry import FILE, geometry_of
-from sat_intervals.heights.lattice import WINDOW, Lattice, between_180, on_map
+from sat_intervals.heights.lattice import WINDOW, Lattice, on_map
 from sat_intervals.heights.point_cloud import PointCloud
 from sat_intervals.products import Bands
 from sat_intervals.progress import Progress
-from sat_intervals.raster import Layer, OutputWriter, Projection, new_file, points_file, utm_of
+from sat_intervals.raster import Layer, OutputWriter, Projection, between_180, new_file, points_file, utm_of
 from sat_intervals.results import Run, open_input, open_run
 from sat_intervals.tiling import Grid, Window
 

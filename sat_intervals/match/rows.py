@@ -69,6 +69,16 @@ class RowFit:
             f"{after:.1f} px from a smooth function, over {self.matches} matches; {_MOST:g} px are searched"
         )
 
+    @property
+    def way_out(self) -> str:
+        """Return what to do about a `contradiction`."""
+        if self.after[0] > _CONTRADICTING:
+            return (
+                "leave out the search range if it is given, check that both images show the same place, resample the "
+                "pair, or give --rows none"
+            )
+        return f"crop or shift the right image, which lies {np.median([look[2] for look in self.looks]):.0f} rows lower"
+
     @classmethod
     def of_report(cls, report: Mapping[str, Any]) -> "RowFit":
         """Read what a report of a survey has of it."""
@@ -106,10 +116,7 @@ class Survey:
         if rows == "none" or self.rows is None:
             return None
         if line := self.rows.contradiction:
-            raise SatIntervalsError(
-                f"{line}: leave out the search range if it is given, check that both images show the same place, "
-                "resample the pair, or give --rows none"
-            )
+            raise SatIntervalsError(f"{line}: {self.rows.way_out}")
         return self.rows.offsets if self.is_large else None
 
     def report(self) -> dict[str, Any]:

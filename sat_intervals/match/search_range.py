@@ -93,6 +93,11 @@ class Found:
 
     def fitted(self, columns: int) -> "Found":
         """Return the range cut at both ends to as many disparities as the right image has columns."""
+        if max(-self.minimum, self.maximum) > MOST_PIXELS:
+            raise NoRangeError(
+                f"disparities of {self.minimum} to {self.maximum} px, beyond {MOST_PIXELS}: crop or shift the images "
+                "so that they are near 0"
+            )
         beyond = max(0, self.maximum - self.minimum + 1 - columns)
         return replace(self, minimum=self.minimum + beyond // 2, maximum=self.maximum - (beyond - beyond // 2))
 
@@ -108,11 +113,6 @@ class Found:
 
 def with_range(config: Config, found: Found) -> Config:
     """The settings with a range that was found."""
-    if max(-found.minimum, found.maximum) > MOST_PIXELS:
-        raise NoRangeError(
-            f"the search range found is {found.minimum} to {found.maximum} px, beyond {MOST_PIXELS}: crop or shift the "
-            "images so that disparities are near 0"
-        )
     ends = {"minimum": found.minimum, "maximum": found.maximum, "open_ends": True}
     disparity = config.disparity.model_copy(update=ends)
     return config.model_copy(update={"disparity": disparity})

@@ -5,7 +5,7 @@ from sat_intervals.raster.cog import Part
 from sat_intervals.raster.files import RUN_FILES, File, points_file, ranges_file, run_files, surface_file, truth_file
 from sat_intervals.raster.files_of import files_of
 from sat_intervals.raster.frame import Frame, Vertical
-from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing, footprint, horizontal_name
+from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing, between_180, footprint, horizontal_name
 from sat_intervals.raster.heightfield import GROUND, HeightRaster, warn_of_no_data
 from sat_intervals.raster.identity import check_not_replaced
 from sat_intervals.raster.images import Image, check_pair, describe, open_image
@@ -48,6 +48,7 @@ __all__ = [
     "Part",
     "Projection",
     "Vertical",
+    "between_180",
     "check_free",
     "check_not_replaced",
     "check_pair",

@@ -42,7 +42,10 @@ def factors(height: int, width: int) -> list[int]:
 
 
 def halved(bands: np.ndarray) -> np.ndarray:
-    """Return ``(bands, rows, columns)`` at half the size: means of the known of 4 values, or every other flag."""
+    """Return ``(bands, rows, columns)`` at half the size: means of the known of 4 values, or every other flag.
+
+    A value whose 4 have less than 2 known is unknown, so that shares of what is known stay.
+    """
     if bands.dtype.kind != "f":
         return bands[:, ::2, ::2]
     rows, columns = (-(-size // 2) for size in bands.shape[1:])
@@ -52,7 +55,7 @@ def halved(bands: np.ndarray) -> np.ndarray:
         total[inner] += np.where(known, part, 0)
         count[inner] += known
     with np.errstate(invalid="ignore"):
-        return np.asarray(total / count, bands.dtype)
+        return np.asarray(np.where(count > 1, total / count, np.nan), bands.dtype)
 
 
 def compressed(bands: np.ndarray, file: File) -> CompressedRow:

@@ -106,10 +106,14 @@ class Georeferencing:
 
 def horizontal_name(crs: CRS) -> str:
     """Return code or WKT of a CRS of rasterio; of a compound one those of its horizontal part."""
-    found = pyproj.CRS.from_wkt(crs.to_wkt())
-    found = found.sub_crs_list[0] if found.is_compound else found
+    found = pyproj.CRS.from_wkt(crs.to_wkt()).to_2d()
     code = found.to_epsg()
     return f"EPSG:{code}" if code else found.to_wkt()
+
+
+def between_180(longitude: Any) -> Any:
+    """Return longitudes as degrees from -180 to 180."""
+    return (longitude + 180) % 360 - 180
 
 
 def footprint(place: Georeferencing, shape: tuple[int, int]) -> Corners | None:
@@ -142,7 +146,7 @@ def footprint(place: Georeferencing, shape: tuple[int, int]) -> Corners | None:
         return None
     found = [to_degrees.transform(x, y) for x, y in corners]
     first = found[0][0]
-    found = [(first + (longitude - first + 180) % 360 - 180, latitude) for longitude, latitude in found]
+    found = [(first + between_180(longitude - first), latitude) for longitude, latitude in found]
     area = sum(x * v - u * y for (x, y), (u, v) in zip(found, found[1:] + found[:1], strict=True))
     return found if area > 0 else found[::-1]
 

@@ -84,7 +84,7 @@ def warn_of_no_data(path: str | Path) -> None:
     with opened(str(path)) as dataset:
         shape = min(_LOOKED, dataset.height), min(_LOOKED, dataset.width)
         heights = dataset.read(1, out_shape=shape)[dataset.read_masks(1, out_shape=shape) != 0]
-    heights = heights[np.isfinite(heights)]
+    heights = heights[(heights >= GROUND[0]) & (heights <= GROUND[1])]
     values, counts = np.unique(heights, return_counts=True)
     if values.size < 2:
         return
@@ -93,9 +93,9 @@ def warn_of_no_data(path: str | Path) -> None:
     away = float(max(low - value, value - high))
     if share > _COMMON and away > _AWAY:
         _LOG.warning(
-            "%s: %.1f %% of its heights are exactly %.9g, %.0f m from the others: if it is no data, declare it, with "
-            "gdal_edit.py -a_nodata %.9g",
-            *(path, 100 * share, value, away, value),
+            "%s: %.1f %% of its heights are exactly %.9g, %.0f m from the others: if it is no data, declare it: "
+            "rio edit-info --nodata %.9g %s",
+            *(path, 100 * share, value, away, value, path),
         )
 
 

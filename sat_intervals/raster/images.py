@@ -191,7 +191,7 @@ def _chosen(path: str, bands: list[int], alphas: list[int], band: int | None) ->
     alpha = f" (band {alphas[0]} is read as alpha)" if alphas else ""
     if band is None and len(bands) > 1:
         raise InputError(
-            f"{path} has {there}{alpha}: choose one with --band, or give a file of one band (gdal_translate -b)"
+            f"{path} has {there}{alpha}: give a file of one band (gdal_translate -b), or --band if there is one"
         )
     if band is not None and band not in bands:
         raise InputError(f"{path} has no image band {band}, it has {there}{alpha}: choose with --band")

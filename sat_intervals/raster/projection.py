@@ -11,12 +11,12 @@ from pyproj.database import query_utm_crs_info
 from pyproj.exceptions import CRSError, ProjError
 
 from sat_intervals.errors import SatIntervalsError, check_file
-from sat_intervals.raster.georeferencing import Georeferencing
+from sat_intervals.raster.georeferencing import Georeferencing, between_180
 from sat_intervals.raster.images import opened
 
 _GEOGRAPHIC = "EPSG:4326"
-# Degrees of latitude from which on UPS replaces UTM.
-_POLAR = 84.0
+# Degrees of latitude beyond which UPS replaces UTM.
+_UTM = -80.0, 84.0
 # Degrees outside the area of a CRS that are accepted: the next UTM zone.
 _BEYOND = 6.0
 # Largest scale error of a map: above that of UTM in the next zone (1 %) and of polar maps at their edges (4 %).
@@ -27,10 +27,10 @@ _LARGEST_UNDULATION = 120.0
 
 def utm_of(longitude: float, latitude: float) -> str:
     """Return the UTM zone of a place (degrees), such as ``EPSG:32637``, or the polar map of UPS."""
-    area = AreaOfInterest(longitude, latitude, longitude, latitude)
-    longitude = (longitude + 180) % 360 - 180
-    if abs(latitude) > _POLAR:
+    longitude = between_180(longitude)
+    if not _UTM[0] <= latitude <= _UTM[1]:
         return "EPSG:32661" if latitude > 0 else "EPSG:32761"
+    area = AreaOfInterest(longitude, latitude, longitude, latitude)
     zones = query_utm_crs_info(datum_name="WGS 84", area_of_interest=area)
     if not zones:
         raise SatIntervalsError(f"no UTM zone at longitude {longitude:.2f}, latitude {latitude:.2f}: give --crs")
@@ -89,7 +89,7 @@ class Projection:
         if not abs(scale - 1) <= _LARGEST_DISTORTION:
             raise SatIntervalsError(
                 f"a metre of {self.crs} is {1 / scale:.3g} m on the ground at {here}: give a map with true scale "
-                f"there, such as its UTM zone {utm_of(longitude, latitude)}"
+                f"there, such as {utm_of(longitude, latitude)}"
             )
         undulation = float(self.undulation(np.array([longitude]), np.array([latitude]))[0])
         if not abs(undulation) <= _LARGEST_UNDULATION:

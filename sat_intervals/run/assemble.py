@@ -14,7 +14,7 @@ import numpy as np
 
 from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError
 from sat_intervals.match.postprocess import ConfidenceScale, confidence_scale
-from sat_intervals.progress import Progress, logged_stage
+from sat_intervals.progress import REPORT, Progress, logged_stage
 from sat_intervals.raster import OutputError, OutputWriter, Part
 from sat_intervals.raster.publishing import new_file
 from sat_intervals.run.inputs import check_unchanged
@@ -37,7 +37,7 @@ from sat_intervals.store.tiles import COSTS, FAILURES, PARTS, PIXELS, Tables, ho
 _THREADS = 2  # that copy parts which workers cannot copy: one reads while another writes
 
 _LOG = logging.getLogger(__name__)
-_WARNINGS = logging.getLogger("sat_intervals.report")  # a command prints them itself, below its table
+_WARNINGS = logging.getLogger(REPORT)
 
 
 def assemble(job: Job, workers: Workers, seconds: dict[str, float], progress: Progress) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Tell what is odd about a run, by cause: no data, rows, search range, noise; and its verdict in one line."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,8 @@ _AMBIGUOUS_SHARE = 0.1
 _AT_ENDS, _AT_END = 0.005, 0.001
 # Share of the pixels of an image that make a collar worth a warning, and rows that are looked at.
 COLLAR, _ROWS = 0.01, 8
+# Share of windows that meet no data from which it is asked if it is isolated, and of valid pixels that are few.
+_SPOILED, _FEW = 0.2, 0.2
 # Times the usual width of intervals that are wide.
 _WIDE = 2.0
 # Rows that make a pair badly resampled, and the distance of matches that makes it noisy.
@@ -37,69 +39,88 @@ def is_plain(image: Image) -> bool:
 def quality_of(job: Job, tables: Tables) -> dict[str, Any]:
     """Return the quality of a pair.
 
-    ``noise``, see `noise_of`; ``collars``, see `Found`; ``whole``, the sides of which no pixel read is no data.
+    ``noise``, see `noise_of`; ``collars``, see `Found`; ``no_data``, the share of pixels without data that tiles have
+    read of each side; ``same``, whether both images have the same pixels.
     """
-    region, sides = job.store.grid.region, (("left", job.left), ("right", job.right))
-    if job.found:
-        collars = job.found.collars
-    else:
-        collars = {side: collar for side, image in sides if (collar := _collar(image, region))}
-    return {"noise": job.survey and job.survey.noise, "collars": collars, "whole": _whole(job, tables)}
+    sides, region = {"left": job.left, "right": job.right}, job.store.grid.region
+    lines = {side: _lines(image, region) for side, image in sides.items()}
+    plain = {side: lines[side] for side, image in sides.items() if is_plain(image)}
+    collars = {side: collar for side, (pixels, state) in plain.items() if (collar := _collar(pixels, state))}
+    collars |= job.found.collars if job.found else {}
+    (left, _), (right, state) = lines.values()
+    same = left.size > 0 and (state == 0).any() and bool(np.array_equal(left, right))
+    noise = job.survey and job.survey.noise
+    return {"noise": noise, "collars": collars, "no_data": _no_data(job, tables), "same": same}
 
 
-def _whole(job: Job, tables: Tables) -> list[str]:
-    """Return the sides of which no tile has read a pixel without data."""
-    whole, ranges = {"left", "right"}, job.ranges()
+def _no_data(job: Job, tables: Tables) -> dict[str, float]:
+    """Return the share of pixels without data among those that tiles have read, by side."""
+    read, usable, ranges = Counter[str](), Counter[str](), job.ranges()
     for tile in job.store.grid:
         windows = patch_windows(frame_of(job, tile), job.config, ranges)
         for side, image, window in zip(("left", "right"), (job.left, job.right), windows, strict=True):
             inside = window.clipped(Window(0, 0, image.height, image.width))
-            if tables.records[tile.name]["usable_pixels"][side] < inside.height * inside.width:
-                whole.discard(side)
-    return sorted(whole)
+            read[side] += inside.height * inside.width
+            usable[side] += tables.records[tile.name]["usable_pixels"][side]
+    return {side: 1 - usable[side] / read[side] if read[side] else 0.0 for side in ("left", "right")}
 
 
-def _collar(image: Image, region: Window) -> dict[str, float] | None:
-    """Return value and share of the pixels of the smallest value that begin or end rows of a region, None if few do."""
+def _lines(image: Image, region: Window) -> tuple[np.ndarray, np.ndarray]:
+    """Read pixels and states of some rows of a region of an image."""
     inside = region.clipped(Window(0, 0, image.height, image.width))
-    if not is_plain(image) or inside.width <= 0:
-        return None
     rows = np.unique(np.linspace(inside.row, inside.row_stop - 1, _ROWS).astype(int))
+    if inside.width <= 0:
+        return np.empty((0, 2)), np.empty((0, 2))
     lines = (read_window(image, Window(int(row), inside.column, 1, inside.width)) for row in rows)
     pixels, state = (np.concatenate(parts) for parts in zip(*lines, strict=True))
-    smallest = pixels.min(where=state == 0, initial=np.inf)
-    has = (pixels == smallest) & (state == 0)
+    return pixels, state
+
+
+def _collar(pixels: np.ndarray, state: np.ndarray) -> dict[str, float] | None:
+    """Return value and share of the pixels that begin or end rows and have their commonest value, None if few do."""
+    values, counts = np.unique(pixels[:, [0, -1]][state[:, [0, -1]] == 0], return_counts=True)
+    if not values.size:
+        return None
+    value = values[counts.argmax()]
+    has = (pixels == value) & (state == 0)
     runs = np.logical_and.accumulate(has, 1) | np.logical_and.accumulate(has[:, ::-1], 1)[:, ::-1]
-    return {"value": float(smallest), "share": round(float(runs.mean()), 4)} if runs.mean() > COLLAR else None
+    is_collar = runs.mean() > COLLAR
+    return {"value": float(value), "share": round(float(runs.mean()), 4)} if is_collar else None
 
 
 def warnings_of(job: Job, counts: Mapping[str, Any], quality: Mapping[str, Any]) -> list[str]:
     """Return the warnings about a run, one line each, the likeliest cause of all others first."""
-    paths, config = (job.left.path, job.right.path), job.config
-    is_census = config.cost.method == "census" and config.preset == "paper"
-    unseen = [
-        f"{image.path}: no pixel that was read is {image.nodata:.9g}, the no-data value given: check --nodata"
-        for side, image in (("left", job.left), ("right", job.right))
-        if image.nodata_given and side in quality["whole"]
-    ]
-    same = [f"{paths[0]} and {paths[1]} are the same image: give the left and the right one"] if _are_same(job) else []
-    lost = _rejected(counts, paths, was_found=bool(job.found))
+    paths, config, found = (job.left.path, job.right.path), job.config, job.survey and job.survey.rows
+    of_data = [*collar_lines(quality["collars"], paths), *_doubts_of_no_data(job, counts, quality["no_data"])]
+    if quality["same"]:
+        of_data.insert(0, f"{paths[0]} and {paths[1]} have the same pixels: give the left and the right image")
     rows = rows_left(job.survey, config.rows, job.right.path)
-    is_doubted = bool(quality["collars"] or (job.survey and job.survey.rows and job.survey.rows.contradiction))
-    of_range = [] if is_doubted else _doubts_of_range(counts, config.disparity, paths[0], was_found=bool(job.found))
-    noise = noise_line(job.survey, paths) if is_census else []
+    was_found = job.found is not None
+    of_range = _doubts_of_range(counts, config.disparity, paths[0], was_found=was_found)
+    if of_data or (found and found.contradiction):
+        of_pair = rows
+    else:  # where a given range is wrong, rows are, too
+        lost = _rejected(counts, paths, was_found=was_found)
+        of_pair = lost or ([] if was_found else of_range) or [*rows, *of_range]
+    noise = noise_line(job.survey, paths) if config.cost.method == "census" and config.preset == "paper" else []
     missed = unreached(config)
-    of_settings = [f"{paths[0]}: {missed}"] if missed else []
-    of_pair = lost or [*rows, *of_range, *noise]
-    return [*same, *collar_lines(quality["collars"], paths), *unseen, *of_pair, *of_settings]
+    return [*of_data, *of_pair, *noise, *([f"{paths[0]}: {missed}"] if missed else [])]
 
 
-def _are_same(job: Job) -> bool:
-    """Return whether two files are copies of each other; members of one archive have the digest of the archive."""
-    of_both = (job.inputs["left"], job.inputs["right"])
-    here, there = ([file.get("sha256") for file in (of, *of["files"])] for of in of_both)
-    are_files = Path(job.left.path).is_file() and Path(job.right.path).is_file()
-    return are_files and job.left.band == job.right.band and here == there
+def _doubts_of_no_data(job: Job, counts: Mapping[str, Any], no_data: Mapping[str, float]) -> list[str]:
+    """Return warnings of a no-data value that no pixel has, and of isolated pixels that spoil many windows."""
+    given = {side: image for side, image in (("left", job.left), ("right", job.right)) if image.nodata_given}
+    lines = []
+    if given and not any(no_data[side] for side in given):
+        image = next(iter(given.values()))
+        lines.append(f"{image.path}: no pixel that was read is {image.nodata:.9g}, the no-data value given: check it")
+    spoiled = counts["causes"]["left_window"] / max(1, counts["pixels"])
+    if spoiled > _SPOILED and spoiled > 3 * no_data["left"]:
+        lines.append(
+            f"{job.left.path}: {100 * no_data['left']:.1f} % of the pixels are no data or masked, but spoil the "
+            f"windows of {100 * spoiled:.0f} %: they are isolated: fill them, or check no data and masks"
+        )
+    return lines
 
 
 def _rejected(counts: Mapping[str, Any], paths: tuple[str, str], *, was_found: bool) -> list[str]:
@@ -134,6 +155,9 @@ def verdict_of(counts: Mapping[str, Any], config: Config, warnings: Sequence[str
     valid = f"{100 * counts['valid'] / max(1, counts['pixels']):.0f} % valid"
     if warnings:
         return f"{valid}, but see the warning{'s, the first one first' if len(warnings) > 1 else ''}"
+    if counts["valid"] < _FEW * counts["pixels"]:
+        worst = max(counts["causes"], key=counts["causes"].__getitem__).replace("_", " ")
+        return f"only {valid}, most of the others by {worst}"
     width, usual = counts["median_interval_width"], _usual_width(config)
     if width is None or usual is None:
         return f"{valid}, nothing unusual"
@@ -178,7 +202,7 @@ def rows_left(survey: Survey | None, rows: str, path: str) -> list[str]:
         return []
     found = survey.rows
     if found.contradiction:
-        return [f"{path}: {found.contradiction}"]
+        return [f"{path}: {found.contradiction}: {found.way_out}"]
     if rows == "none" and survey.is_large and found.before[0] > _ROW_OFFSET:
         return [f"{path}: rows differ by {found.before[0]:.1f} px in the median: match with --rows auto"]
     if found.has_jitter:

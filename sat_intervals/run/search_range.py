@@ -95,14 +95,14 @@ def search_range(workers: Workers, left: Image, right: Image, progress: Progress
             pixels[found] = np.nan
         small.append(pixels)
     try:
-        found_range, _ = find_range(small[0], small[1], step, (left.height, left.width))
+        found_range = find_range(small[0], small[1], step, (left.height, left.width))[0].fitted(right.width)
     except NoRangeError as error:
         hints = "".join(f"; {line}" for line in collar_lines(collars, (left.path, right.path)))
         raise NoRangeError(
             f"{left.path} and {right.path}: {error}{hints}: give the search range with --disparity MIN MAX, or check "
             "that the images are an epipolar pair"
         ) from None
-    return replace(found_range.fitted(right.width), collars=collars)
+    return replace(found_range, collars=collars)
 
 
 @contextmanager

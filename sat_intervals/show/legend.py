@@ -28,7 +28,7 @@ class PixelClass(NamedTuple):
 
 
 PIXEL_CLASSES = (
-    PixelClass("#f2f2f2", "valid", 0),
+    PixelClass("#f2f2f2", "valid, high confidence", 0),
     PixelClass(SKY, "valid, low confidence", REGULARIZED),
     *(PixelClass(_INVALID[flag.name], flag.meaning, flag.value) for flag in FLAGS if flag.invalid),
 )

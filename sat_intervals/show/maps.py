@@ -50,7 +50,7 @@ def draw_overview(results: Results, target: Path, dpi: int = DPI) -> None:
     frame = Frame.of(results.shape)
     size = columns * (width + 1.0), rows * (height + 0.6) + 0.3
     ratio = results.region.height * results.region.width / (shape[0] * shape[1])
-    thinned = [f"one pixel in {ratio:,.{0 if ratio >= 10 else 1}f} shown"] if shape != results.shape else []
+    thinned = [f"means of {ratio:,.{0 if ratio >= 10 else 1}f} pixels"] if shape != results.shape else []
     words = [results.report["verdict"], *(f"warning: {line}" for line in results.report["warnings"])]
     title = "\n".join([_caption(results, thinned), *(fill(line, round(_LETTERS * size[0])) for line in words)])
     with page(target, size, dpi, title, results.report["finished"]) as figure:

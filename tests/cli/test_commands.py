@@ -127,7 +127,7 @@ def done(folder, tmp_path_factory):
         ({"right": "zone.tif"}, ["left.tif", "zone.tif have different CRS, EPSG:32631 and EPSG:32632", "resample"]),
         ({"right": "metre.tif"}, ["metre.tif have different pixel sizes, 0.5 x 0.5 and 1 x 1", "resample"]),
         ({"right": "complex.tif"}, ["complex.tif: band 1 is complex64", "give its amplitude"]),
-        ({"right": "bands.tif"}, ["bands.tif has bands 1 to 3: choose one with --band"]),
+        ({"right": "bands.tif"}, ["bands.tif has bands 1 to 3: give a file of one band"]),
     ],
     ids=lambda value: "-".join(value.values()) if isinstance(value, dict) else "",
 )

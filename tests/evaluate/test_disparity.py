@@ -420,7 +420,7 @@ def test_command__matches_pairs_and_prints_a_table(pair, run, tmp_path):
     assert not [line for line in shown.splitlines() if not line.startswith("sat-intervals: ")]
     label, scenes, reached, accuracy, *_ = text.splitlines()[2].split()
     assert (label, scenes) == ("synthetic", "2")
-    assert "alpha, measured coverage, widths and interval score (px), valid pixels" in text
+    assert "alpha, measured coverage, widths, interval score and disparity - truth (px)" in text
     accuracies = [reports[name]["all"]["accuracy"] for name in ("one", "two")]
     assert int(reached) == sum(value >= 0.9 for value in accuracies)
     assert accuracy == f"{np.mean(accuracies):.3f}"

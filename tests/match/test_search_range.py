@@ -107,8 +107,8 @@ def test_match_arrays__finds_the_range_that_is_not_given(scene):
 
 
 @pytest.mark.parametrize("ends", [(-17_100, -16_900), (15_990, 16_010)])
-def test_with_range__refuses_a_range_that_no_settings_hold(ends):
-    config = load_config({"disparity": {"minimum": "auto", "maximum": "auto"}})
+def test_fitted__refuses_a_range_that_no_settings_hold(ends):
     with pytest.raises(NoRangeError, match="beyond 16000: crop or shift the images"):
-        with_range(config, Found(*ends, matched=0.5, levels=()))
-    assert load_config(with_range(config, Found(-16_000, -15_900, 0.5, ())).model_dump()).disparity.minimum == -16_000
+        Found(*ends, matched=0.5, levels=()).fitted(40_000)
+    kept = with_range(load_config(), Found(-16_000, -15_900, 0.5, ()).fitted(40_000))
+    assert load_config(kept.model_dump()).disparity.minimum == -16_000

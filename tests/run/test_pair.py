@@ -96,8 +96,8 @@ def test_match_pair__warns_of_images_without_texture(pair, tmp_path, caplog):
     pixels[:, 60:] = 900
     for name in ("left", "right"):
         with rasterio.open(tmp_path / f"{name}.tif", "w", **profile) as file:
+            pixels[0, :9] = 700 + (name == "left")  # else the same image twice
             file.write(pixels, 1)
-            file.update_tags(SIDE=name)  # else the same image twice
     flat = {"disparity": {"minimum": -4, "maximum": 4}}
     counts = match_pair(tmp_path / "left.tif", tmp_path / "right.tif", tmp_path / "out", flat)["counts"]
     _, lower, upper, _ = bands(tmp_path / "out")[0]

@@ -475,5 +475,5 @@ def test_open_results__refuses_other_images_than_those_of_the_run(tmp_path):
 def test_classify__takes_the_first_reason():
     validity = np.array([0, NOT_REFINED, REGULARIZED, MISMATCH | REGULARIZED, LEFT_WINDOW | OCCLUSION], np.uint16)
     meanings = [PIXEL_CLASSES[place].meaning for place in classify(validity)]
-    assert meanings[:2] == ["valid", "valid"]
+    assert meanings[:2] == ["valid, high confidence"] * 2
     assert meanings[2:] == ["valid, low confidence", FLAGS[7].meaning, FLAGS[0].meaning]

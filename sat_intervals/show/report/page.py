@@ -74,7 +74,7 @@ def _surface(results: Results) -> dict[str, Any] | None:
     known, halves = np.isfinite(height), (upper - lower)[np.isfinite(lower)] / 2
     low, middle, high = np.percentile(height[known], (2, 50, 98)) if known.any() else [float("nan")] * 3
     figures = {
-        "size": f"{rows} x {columns} cells of {place.pixel_size[0]:g} m",
+        "surface model": f"{rows} x {columns} cells of {place.pixel_size[0]:g} m",
         "cells with a height": f"{100 * known.mean():.1f} %",
         "heights, 2 %, median, 98 %": f"{low:.2f}, {middle:.2f}, {high:.2f} m",
     }

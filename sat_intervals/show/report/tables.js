@@ -74,20 +74,19 @@ function showHistograms() {
 function showEvaluation() {
   const judged = contents.evaluation;
   if (!judged) return;
-  const size = (share) => (share === null ? "none" : fixed(share, 3));
   const row = (name, figures) => [
-    name, figures.count, percent(figures.accuracy), size(figures.relative_size),
-    figures.mean_width === null ? "none" : `${fixed(figures.mean_width, 2)} px`, size(figures.relative_overestimation ?? null),
+    name, figures.count, percent(figures.accuracy),
+    figures.mean_width === null ? "none" : `${fixed(figures.mean_width, 2)} px`,
     figures.interval_score === null ? "none" : `${fixed(figures.interval_score, 2)} px`,
   ];
   const rows = [row("all", judged.all), row("high confidence", judged.high), row("low confidence", judged.low)];
-  const head = ["valid pixels", "count", "accuracy: contain the truth", "relative size", "mean width", "relative overestimation", "interval score"];
+  const head = ["valid pixels", "count", "coverage: contain the truth", "mean width", "interval score"];
   find("evaluation").hidden = false;
   find("evaluation").append(
     element("p", {}, "Truth: ", element("code", {}, contents.truth), ". Disparity errors above 1 px: ",
       `${percent(judged.bad1)}, above 3 px: ${percent(judged.bad3)}; truths outside the search range: ${percent(judged.truth_outside_range)}.`),
     table(head, rows),
-    element("p", { class: "quiet" }, "Relative size is the median width over the width of the search range. The interval score is the width, and 2 / (1 - nominal) times the distance of a missed truth. " + nominalSentence()),
+    element("p", { class: "quiet" }, "The interval score is the width, and 2 / (1 - nominal) times the distance of a missed truth. " + nominalSentence()),
   );
   if (judged.deciles.length) showDeciles(judged.deciles);
 }
