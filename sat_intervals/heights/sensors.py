@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.errors import SatIntervalsError, check_file
+from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.lattice import Lattice
 from sat_intervals.kernels.compiled import kernels_of_others
 from sat_intervals.kernels.rows import RowOffsets
@@ -21,9 +21,9 @@ try:
     with kernels_of_others():
         from shareloc.geofunctions.rectification_grid import RectificationGrid
         from shareloc.geofunctions.triangulation import epipolar_triangulation
-        from shareloc.geomodels import GeoModel
 
         from sat_intervals.heights.grids import read_grid
+        from sat_intervals.heights.models import read_model, read_with
 except ModuleNotFoundError as error:
     raise SatIntervalsError("triangulation needs shareloc: pip install 'sat-intervals[dsm]'") from error
 
@@ -58,10 +58,9 @@ class Sensors:
         left: Georeferencing | None = None,
         rows: RowOffsets | None = None,
     ) -> "Sensors":
-        """Read RPC models (GeoTIFF tags, ``.geom``, DIMAP XML) and epipolar grids, see `grids.read_grid`."""
-        model = partial(_read, kind="RPC model", reader=GeoModel)
-        grid = partial(_read, kind="epipolar grid", reader=partial(read_grid, left=left or Georeferencing()))
-        return cls(model(left_model), model(right_model), grid(left_grid), grid(right_grid), rows)
+        """Read RPC models, see `models.read_model`, and epipolar grids, see `grids.read_grid`."""
+        grid = partial(read_with, kind="epipolar grid", reader=partial(read_grid, left=left or Georeferencing()))
+        return cls(read_model(left_model), read_model(right_model), grid(left_grid), grid(right_grid), rows)
 
     def triangulate(self, row: np.ndarray, column: np.ndarray, disparity: np.ndarray) -> np.ndarray:
         """Return ``(n, 4)`` longitude, latitude, height and residual of epipolar positions ``(n,)``.
@@ -83,18 +82,6 @@ class Sensors:
         except SystemError as error:  # numba's word for an interrupt
             raise error.__cause__ or error from None
         return np.column_stack([points, np.max(residuals, axis=1)])
-
-
-def _read(path: Path, kind: str, reader: Any) -> Any:
-    check_file(path, f"give the {kind} of the image")
-    try:
-        with warnings.catch_warnings(action="ignore"):
-            return reader(str(path))
-    except SatIntervalsError:
-        raise
-    except Exception as error:  # shareloc, scipy and GDAL raise many types
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise SatIntervalsError(f"shareloc cannot read {path} as {kind}: {reason}") from error
 
 
 def lattice_of(
