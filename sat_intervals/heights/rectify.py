@@ -111,7 +111,7 @@ def _begin(out: Path, asked: dict[str, Any], before: dict[str, Any], *, overwrit
     """
     files = [out / name for name in (*IMAGES, *GRIDS)]
     read = [file["path"] for one in asked["inputs"].values() for file in (one, *one.get("files", ()))]
-    check_not_replaced([name for path in read for name in (path,)], [*files, out / FILE])
+    check_not_replaced(read, [*files, out / FILE])
     changes = list(differences({name: before.get(name) for name in asked}, asked)) if before else []
     if not overwrite:
         if changes:
