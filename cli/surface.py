@@ -1,6 +1,7 @@
 """``sat-intervals surface``: from two epipolar images to a surface model in one command."""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ from sat_intervals.cli.matching import (
     search_options,
 )
 from sat_intervals.cli.options import FILE, SensorFiles, json_option, note_geometry, say_json, sensor_options
+from sat_intervals.cli.rectify import raw_options, rectified
 from sat_intervals.cli.triangulate import geometry_warnings
 
 if TYPE_CHECKING:
@@ -32,7 +34,8 @@ _FILES = "geometry.json", "dsm.tif"
 @search_options
 @pair_options
 @click.argument("out", type=FILE)
-@sensor_options
+@partial(sensor_options, models_alone=True)
+@raw_options
 @cell_options
 @calibration_option("--height-calibration")
 @json_option
@@ -40,28 +43,33 @@ _FILES = "geometry.json", "dsm.tif"
 def surface(
     pair: PairArguments,
     out: Path,
-    sensor_files: list[SensorFiles],
+    sensor_files: list[tuple[Path, ...]],
+    raw: dict[str, Any],
     cells: dict[str, Any],
     as_json: bool,
     settings: SettingsArguments,
     run: RunArguments,
 ) -> None:
-    """Match the epipolar images LEFT and RIGHT and write the surface model of the run to OUT/dsm.tif.
+    """Match the images LEFT and RIGHT and write the surface model to OUT/dsm.tif.
 
-    The same as `match` and `dsm`, with their options and files. To resume, rerun the same command: a finished match
-    with these images and settings is kept, the surface is made again.
+    LEFT and RIGHT are raw images with RPC models, or an epipolar pair with the models and grids of its raw images. Raw
+    images become the epipolar pair OUT/left.tif, OUT/right.tif, as by `rectify`; heights of --dem refer to --geoid.
+
+    The same as `rectify`, `match` and `dsm`, with their options and files. To resume, rerun the same command: what is
+    finished with these images and settings is kept, the surface is made again.
     """
     from sat_intervals.cli.console import Console
 
-    if len(sensor_files) != 1:
+    if len(sensor_files) > 1:
         raise click.UsageError("give --left-model, --right-model, --left-grid and --right-grid once.")
-    (files,) = sensor_files
-
     config = settings.load()
     with Console(run.quiet or as_json) as console:
         from sat_intervals.config import resolved
 
-        _check(cells, files, resolved(config).interval)
+        interval = resolved(config).interval
+        _check(cells, None, interval)
+        pair, files = _epipolar(pair, sensor_files, raw | {"geoid": cells["geoid"]}, out, run, console)
+        _check(cells, files, interval)
         _check_kept(out, cells, [*files, *pair.files], settings.file)
         left, right = pair.open()
         report = run.match(left, right, out, config, window=pair.window, progress=console.progress)
@@ -72,6 +80,32 @@ def surface(
     say_surface(console, made)
     console.say(str(out / "dsm.tif"))
     run.check_strict([*report["warnings"], *geometry_warnings(made["geometry"])])
+
+
+def _epipolar(
+    pair: PairArguments,
+    sensor_files: Sequence[tuple[Path, ...]],
+    raw: dict[str, Any],
+    out: Path,
+    run: RunArguments,
+    console: "Console",
+) -> tuple[PairArguments, SensorFiles]:
+    """Return an epipolar pair with its models and grids; raw images are rectified in the folder of the run."""
+    from sat_intervals.heights.rectified import GRIDS, IMAGES, rectified_files
+
+    given = sensor_files[0] if sensor_files else ()
+    if len(given) == len(GRIDS) + 2:
+        return pair, (given[0], given[1], given[2], given[3])
+    if not given and (made := rectified_files(*pair.images)):
+        return pair, made
+    if pair.window:
+        raise click.UsageError("--window is a region of an epipolar image: rectify these raw images, then match them.")
+    models = (given[0], given[1]) if given else (None, None)
+    rectified(pair, out, models, raw, overwrite=run.overwrite, console=console, rows=False)
+    left, right = (str(out / name) for name in IMAGES)
+    made = rectified_files(left, right)
+    assert made
+    return PairArguments((left, right), (None, None), (None, None), (None, None), None), made
 
 
 def _check_kept(
@@ -107,14 +141,15 @@ def _surface(out: Path, sensor_files: SensorFiles, cells: dict[str, Any], consol
     return make_surface([out], out / "dsm.tif", **cells, progress=console.progress)
 
 
-def _check(cells: dict[str, Any], sensor_files: Sequence[str | Path], interval: "Interval | None") -> None:
+def _check(cells: dict[str, Any], sensor_files: Sequence[str | Path] | None, interval: "Interval | None") -> None:
     """Raise for what the later steps cannot use, before hours of matching."""
     from sat_intervals.heights.dsm import checked_cells, surface_tags
     from sat_intervals.heights.sensors import Sensors
 
     _, cell, _, radius = checked_cells(*(cells[name] for name in ("resolution", "crs", "radius", "geoid")))
     surface_tags(["run"], [interval], cells["choices"].for_intervals([interval]), cell, radius)
-    Sensors.load(*map(Path, sensor_files))
+    if sensor_files:
+        Sensors.load(*map(Path, sensor_files))
 
 
 def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -> "Finish":

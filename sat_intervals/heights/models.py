@@ -69,7 +69,8 @@ class SensorImage:
         file = str(model) if model else find_model(image.path)
         if file is None:
             raise SatIntervalsError(
-                f"{image.path} has no RPC model, in its tags or beside it: give it with --left-model or --right-model"
+                f"{image.path} has no RPC model in its tags or beside it: give --left-model and --right-model; of an "
+                "epipolar image --left-grid and --right-grid, too"
             )
         read = cls(image, file, read_model(file), _origin(image))
         read._check()

@@ -113,16 +113,15 @@ def _begin(out: Path, asked: dict[str, Any], before: dict[str, Any], *, overwrit
     read = [file["path"] for one in asked["inputs"].values() for file in (one, *one.get("files", ()))]
     check_not_replaced(read, [*files, out / FILE])
     changes = list(differences({name: before.get(name) for name in asked}, asked)) if before else []
-    if not overwrite:
-        if changes:
-            raise SatIntervalsError(
-                f"{out} already holds a pair made otherwise: {'; '.join(changes)}: choose another folder or --overwrite"
-            )
-        if before.get("finished") and all(file.exists() for file in files):
-            return False
-        if not before:
-            for file in (*files, out / FILE):
-                check_free(file, overwrite=False)
+    if before.get("finished") and not changes and all(file.exists() for file in files):
+        return False
+    if changes and not overwrite:
+        raise SatIntervalsError(
+            f"{out} already holds a pair made otherwise: {'; '.join(changes)}: choose another folder or --overwrite"
+        )
+    if not before:
+        for file in (*files, out / FILE):
+            check_free(file, overwrite=overwrite)
     write_file(out / FILE, json.dumps(asked | {"finished": None}, indent=1).encode())
     return True
 

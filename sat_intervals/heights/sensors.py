@@ -11,21 +11,18 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.lattice import Lattice
+from sat_intervals.heights.models import read_model, read_with  # raises without the extra `dsm`
 from sat_intervals.kernels.compiled import kernels_of_others
 from sat_intervals.kernels.rows import RowOffsets
 from sat_intervals.progress import Progress
 from sat_intervals.raster import GROUND, Georeferencing
 from sat_intervals.tiling import Window
 
-try:
-    with kernels_of_others():
-        from shareloc.geofunctions.rectification_grid import RectificationGrid
-        from shareloc.geofunctions.triangulation import epipolar_triangulation
+with kernels_of_others():
+    from shareloc.geofunctions.rectification_grid import RectificationGrid
+    from shareloc.geofunctions.triangulation import epipolar_triangulation
 
-        from sat_intervals.heights.grids import read_grid
-        from sat_intervals.heights.models import read_model, read_with
-except ModuleNotFoundError as error:
-    raise SatIntervalsError("triangulation needs shareloc: pip install 'sat-intervals[dsm]'") from error
+    from sat_intervals.heights.grids import read_grid
 
 # Pixels between nodes of the lattice: interpolation errors are below 1 mm.
 _SPACING = 32
