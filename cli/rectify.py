@@ -1,5 +1,6 @@
 """``sat-intervals rectify``: make an epipolar pair of two raw images."""
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -110,14 +111,15 @@ def rectified(
     left, right = pair.open()
     terrain = Terrain(raw["dem"], raw["altitude"], raw["geoid"] if raw["dem"] else None)
     raw_pair = RawPair(left, right, models, terrain, raw["resolution_of"])
-    compare = (lambda *images: compared_rows(*images, console.progress)) if rows else None
+    compare = partial(compared_rows, progress=console.progress) if rows else None
     record = rectify(raw_pair, out, overwrite=overwrite, compare=compare, progress=console.progress)
     for side in ("left", "right"):
         console.say(f"model of the {side} image: {record['inputs'][f'{side}_model']['path']}")
     height = "a DEM" if record["altitude"] is None else f"{record['altitude']:.0f} m"
     console.say(
         f"disparity 0 at {height}, {-record['metres_per_disparity']:.2f} m a pixel; base-to-height ratio "
-        f"{record['base_to_height']:.2f}, pixels of {record['pixel_size']:.2f} m, {100 * record['overlap']:.0f} % overlap"
+        f"{record['base_to_height']:.2f}, pixels of {record['pixel_size']:.2f} m, "
+        f"{100 * record['overlap']:.0f} % overlap"
     )
     if found := record["rows"]:
         console.say(f"rows: {found['text']}")

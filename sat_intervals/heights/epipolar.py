@@ -89,7 +89,7 @@ def epipolar_geometry(left: SensorImage, right: SensorImage, terrain: Terrain, r
     height = likely_height(left, right) if terrain.altitude is None else terrain.altitude
     for one in (left, right):
         one.check_height(height)
-    elevation = _dem(left, right, terrain, height) if terrain.dem else height
+    elevation = _dem(left, right, terrain.dem, terrain.geoid, height) if terrain.dem else height
     share, parts = common_parts(left, right, elevation, _BEYOND)
     if parts is None:
         raise SatIntervalsError(
@@ -106,7 +106,7 @@ def epipolar_geometry(left: SensorImage, right: SensorImage, terrain: Terrain, r
             f"{left.image.path} and {right.image.path} have a base-to-height ratio of {base_to_height:.3f}: heights "
             f"need at least {_LEAST_BASE:g}: give another pair"
         )
-    scales = tuple(max(1.0, scale) if scale > _EQUAL else 1.0 for scale in (spacing, spacing / ratio))
+    left_scale, right_scale = (scale if scale > _EQUAL else 1.0 for scale in (spacing, spacing / ratio))
     figures = {
         "altitude": None if terrain.dem else round(height, 3),
         "overlap": round(share, 4),
@@ -115,12 +115,12 @@ def epipolar_geometry(left: SensorImage, right: SensorImage, terrain: Terrain, r
         "metres_per_disparity": round(-spacing / base, 4),
         "footprint": _footprint(left, nodes[0], shape, height),
     }
-    return Epipolar(*nodes, *shape, scales, figures)
+    return Epipolar(*nodes, *shape, (left_scale, right_scale), figures)
 
 
 def likely_height(left: SensorImage, right: SensorImage) -> float:
     """Return the height in the domain of both models at which most of the left image is on the right one."""
-    lowest, highest = (pick(pair) for pick, pair in zip((max, min), zip(left.heights, right.heights), strict=True))
+    lowest, highest = max(left.heights[0], right.heights[0]), min(left.heights[1], right.heights[1])
     heights = np.linspace(lowest, max(lowest, highest), _HEIGHTS)
     shares = shares_at(left, right, heights)
     return float(heights[shares >= _AS_GOOD * shares.max()].mean())
@@ -164,15 +164,15 @@ def _footprint(left: SensorImage, nodes: np.ndarray, shape: tuple[int, int], hei
     return [[round(float(value), 7) for value in corner[:2]] for corner in ground]
 
 
-def _dem(left: SensorImage, right: SensorImage, terrain: Terrain, height: float) -> DTMIntersection:
+def _dem(left: SensorImage, right: SensorImage, dem: Path, geoid: Path | None, height: float) -> DTMIntersection:
     """Return the DEM around the overlap, as shareloc reads it; raise if it does not cover it."""
     _, parts = common_parts(left, right, height, _BEYOND)
     part = parts[0] if parts else Window(0, 0, left.image.height, left.image.width)
     rows = left.origin[0] + part.row + np.array([0.0, 0.0, part.height, part.height])
     columns = left.origin[1] + part.column + np.array([0.0, part.width, 0.0, part.width])
     ground = left.model.direct_loc_h(rows, columns, height)[:, :2]
-    window = window_of_ground(terrain.dem, (*ground.min(axis=0), *ground.max(axis=0)), _AROUND)
+    window = window_of_ground(dem, (*ground.min(axis=0), *ground.max(axis=0)), _AROUND)
     roi = [window.row, window.column, window.row_stop, window.column_stop]
     with warnings.catch_warnings(action="ignore"):
-        read = dtm_reader(str(terrain.dem), terrain.geoid and str(terrain.geoid), roi=roi)
+        read = dtm_reader(str(dem), geoid and str(geoid), roi=roi)
     return DTMIntersection(read.epsg, read.alt_data, read.nb_rows, read.nb_columns, read.transform)

@@ -130,7 +130,8 @@ def _origin(image: Image) -> tuple[float, float]:
 def shares_at(left: SensorImage, right: SensorImage, heights: np.ndarray) -> np.ndarray:
     """Return the shares of the left image that the right one shows at some heights ``(n,)`` in metres."""
     rows, columns = _spread(left)
-    there = _in_right(left, right, *(np.tile(place, heights.size) for place in (rows, columns)), heights.repeat(rows.size))
+    each = np.tile(rows, heights.size), np.tile(columns, heights.size), heights.repeat(rows.size)
+    there = _in_right(left, right, each[0], each[1], each[2])
     return np.asarray(right.contains(there[:, 0], there[:, 1]).reshape(heights.size, -1).mean(axis=1))
 
 

@@ -32,5 +32,5 @@ def rectified_files(left: str | Path, right: str | Path) -> tuple[Path, Path, Pa
         return None
     if not record["finished"]:
         raise SatIntervalsError(f"{folder} holds an unfinished pair: rerun rectify")
-    models = (Path(record["inputs"][f"{side}_model"]["path"]) for side in ("left", "right"))
-    return (*models, *(folder / name for name in GRIDS))
+    left_model, right_model = (Path(record["inputs"][f"{side}_model"]["path"]) for side in ("left", "right"))
+    return left_model, right_model, folder / GRIDS[0], folder / GRIDS[1]

@@ -12,11 +12,11 @@ import numpy as np
 
 from sat_intervals.errors import ChangedInputError, SatIntervalsError
 from sat_intervals.heights.rectified import FILE, GRIDS, IMAGES, read_record
+from sat_intervals.products import Band
 from sat_intervals.progress import Progress
-from sat_intervals.raster import File, Georeferencing, Image, OutputWriter, check_not_replaced, describe, files_of
+from sat_intervals.raster import File, Georeferencing, Image, OutputWriter, check_not_replaced, describe
 from sat_intervals.raster.identity import identity
 from sat_intervals.raster.publishing import check_free, write_file
-from sat_intervals.products import Band
 from sat_intervals.store.lock import locked
 from sat_intervals.store.manifest import differences
 
@@ -139,8 +139,9 @@ def _writer(out: Path, pair: RawPair, geometry: "Epipolar") -> OutputWriter:
 def _grid_writer(out: Path, geometry: "Epipolar") -> OutputWriter:
     from sat_intervals.heights.epipolar import grid_place
 
+    rows, columns, _ = geometry.left.shape
     files = [File(name, "float64", None, _NODES) for name in GRIDS]
-    return OutputWriter(out, files, *geometry.left.shape[:2], grid_place(), _TAGS)
+    return OutputWriter(out, files, rows, columns, grid_place(), _TAGS)
 
 
 def _write_images(
