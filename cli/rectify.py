@@ -109,7 +109,7 @@ def rectified(
     from sat_intervals.run.rows import compared_rows
 
     left, right = pair.open()
-    terrain = Terrain(raw["dem"], raw["altitude"], raw["geoid"] if raw["dem"] else None)
+    terrain = Terrain(raw["dem"], raw["altitude"], raw["geoid"])
     raw_pair = RawPair(left, right, models, terrain, raw["resolution_of"])
     compare = partial(compared_rows, progress=console.progress) if rows else None
     record = rectify(raw_pair, out, overwrite=overwrite, compare=compare, progress=console.progress)

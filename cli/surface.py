@@ -68,7 +68,7 @@ def surface(
 
         interval = resolved(config).interval
         _check(cells, None, interval)
-        pair, files = _epipolar(pair, sensor_files, raw | {"geoid": cells["geoid"]}, out, run, console)
+        pair, files = _epipolar(pair, sensor_files, raw | {"geoid": cells["geoid"] if raw["dem"] else None}, out, run, console)
         _check(cells, files, interval)
         _check_kept(out, cells, [*files, *pair.files], settings.file)
         left, right = pair.open()

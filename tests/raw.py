@@ -44,7 +44,11 @@ def _scale(path, off, slope):
         line[0] += off
         for axis, numbers, size in (("line", line, dataset.height), ("samp", samp, dataset.width)):
             numbers[0] -= size / 2
-            known |= {f"{axis}_num_coeff": list(numbers / (size / 2)), f"{axis}_off": size / 2, f"{axis}_scale": size / 2}
+            known |= {
+                f"{axis}_num_coeff": list(numbers / (size / 2)),
+                f"{axis}_off": size / 2,
+                f"{axis}_scale": size / 2,
+            }
         dataset.rpcs, dataset.nodata = RPC(**known), 0
 
 

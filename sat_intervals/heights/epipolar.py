@@ -164,8 +164,8 @@ def _footprint(left: SensorImage, nodes: np.ndarray, shape: tuple[int, int], hei
     return [[round(float(value), 7) for value in corner[:2]] for corner in ground]
 
 
-def _dem(left: SensorImage, right: SensorImage, dem: Path, geoid: Path | None, height: float) -> DTMIntersection:
-    """Return the DEM around the overlap, as shareloc reads it; raise if it does not cover it."""
+def _dem(left: SensorImage, right: SensorImage, dem: Path, geoid: Path | None, height: float) -> Any:
+    """Return the DEM around the overlap as shareloc reads it, or its only height; raise if it does not cover it."""
     _, parts = common_parts(left, right, height, _BEYOND)
     part = parts[0] if parts else Window(0, 0, left.image.height, left.image.width)
     rows = left.origin[0] + part.row + np.array([0.0, 0.0, part.height, part.height])
@@ -175,4 +175,6 @@ def _dem(left: SensorImage, right: SensorImage, dem: Path, geoid: Path | None, h
     roi = [window.row, window.column, window.row_stop, window.column_stop]
     with warnings.catch_warnings(action="ignore"):
         read = dtm_reader(str(dem), geoid and str(geoid), roi=roi)
+    if not np.ptp(read.alt_data):  # the sea: shareloc finds no points on one height
+        return float(read.alt_data.flat[0])
     return DTMIntersection(read.epsg, read.alt_data, read.nb_rows, read.nb_columns, read.transform)

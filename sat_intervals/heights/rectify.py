@@ -66,11 +66,13 @@ def rectify(
     with locked(out):
         before = read_record(out) or {}
         asked = _asked(pair, left, right, before.get("inputs", {}))
-        if not _begin(out, asked, before, overwrite=overwrite):
+        if not _is_needed(out, asked, before, overwrite=overwrite):
             return before
         from sat_intervals.heights.epipolar import epipolar_geometry
 
         geometry = epipolar_geometry(left, right, pair.terrain, pair.resolution_of)
+        # from now on, files in the folder may be what a death of this command has left
+        write_file(out / FILE, json.dumps(asked | {"finished": None}, indent=1).encode())
         with _writer(out, pair, geometry) as images, _grid_writer(out, geometry) as grids:
             _write_images(images, (left, right), geometry, progress)
             grids.write(0, *(np.moveaxis(nodes[..., ::-1], -1, 0) for nodes in (geometry.left, geometry.right)))
@@ -104,11 +106,8 @@ def _asked(pair: RawPair, left: "SensorImage", right: "SensorImage", known: dict
     return content
 
 
-def _begin(out: Path, asked: dict[str, Any], before: dict[str, Any], *, overwrite: bool) -> bool:
-    """Return whether there is something to do; raise if files in the folder are not of this pair.
-
-    A record without an end says that files there are what a death of the same command left.
-    """
+def _is_needed(out: Path, asked: dict[str, Any], before: dict[str, Any], *, overwrite: bool) -> bool:
+    """Return whether there is something to do; raise if files in the folder are not of this pair."""
     files = [out / name for name in (*IMAGES, *GRIDS)]
     read = [file["path"] for one in asked["inputs"].values() for file in (one, *one.get("files", ()))]
     check_not_replaced(read, [*files, out / FILE])
@@ -122,7 +121,6 @@ def _begin(out: Path, asked: dict[str, Any], before: dict[str, Any], *, overwrit
     if not before:
         for file in (*files, out / FILE):
             check_free(file, overwrite=overwrite)
-    write_file(out / FILE, json.dumps(asked | {"finished": None}, indent=1).encode())
     return True
 
 
