@@ -1,6 +1,7 @@
 """``sat-intervals surface``: from two epipolar images to a surface model in one command."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
     from sat_intervals.config import Interval
     from sat_intervals.config.pairs import PairOfBatch
-    from sat_intervals.run.batch import Finish
+    from sat_intervals.run.batch import Begin, Finish
 
 # What is made of a run, in its folder.
 _FILES = "geometry.json", "dsm.tif"
@@ -68,7 +69,9 @@ def surface(
 
         interval = resolved(config).interval
         _check(cells, None, interval)
-        pair, files = _epipolar(pair, sensor_files, raw | {"geoid": cells["geoid"] if raw["dem"] else None}, out, run, console)
+        raw |= {"geoid": cells["geoid"] if raw["dem"] else None}
+        given = sensor_files[0] if sensor_files else ()
+        pair, files = _epipolar(pair, given, raw, out, console, overwrite=run.overwrite)
         _check(cells, files, interval)
         _check_kept(out, cells, [*files, *pair.files], settings.file)
         left, right = pair.open()
@@ -84,24 +87,23 @@ def surface(
 
 def _epipolar(
     pair: PairArguments,
-    sensor_files: Sequence[tuple[Path, ...]],
+    given: Sequence[Path],
     raw: dict[str, Any],
     out: Path,
-    run: RunArguments,
     console: "Console",
+    *,
+    overwrite: bool,
 ) -> tuple[PairArguments, SensorFiles]:
     """Return an epipolar pair with its models and grids; raw images are rectified in the folder of the run."""
     from sat_intervals.heights.rectified import GRIDS, IMAGES, rectified_files
 
-    given = sensor_files[0] if sensor_files else ()
-    if len(given) == len(GRIDS) + 2:
+    if len(given) == 2 + len(GRIDS):
         return pair, (given[0], given[1], given[2], given[3])
     if not given and (made := rectified_files(*pair.images)):
         return pair, made
     if pair.window:
         raise click.UsageError("--window is a region of an epipolar image: rectify these raw images, then match them.")
-    models = (given[0], given[1]) if given else (None, None)
-    rectified(pair, out, models, raw, overwrite=run.overwrite, console=console, rows=False)
+    rectified(pair, out, tuple(given) or (None, None), raw, overwrite=overwrite, console=console, rows=False)
     left, right = (str(out / name) for name in IMAGES)
     made = rectified_files(left, right)
     assert made
@@ -129,7 +131,7 @@ def _check_kept_by_all(pairs: "Sequence[PairOfBatch]", out: Path) -> None:
     images = [file for pair in pairs for file in (pair.left, pair.right, pair.left_mask, pair.right_mask)]
     sensors = [file for pair in pairs for file in pair.sensors or ()]
     check_not_replaced(
-        [*images, *sensors], [out / pair.name / name for pair in pairs if pair.sensors for name in _FILES]
+        [*images, *sensors], [out / pair.name / name for pair in pairs if pair.resolution for name in _FILES]
     )
 
 
@@ -162,22 +164,22 @@ def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -
 
     cells = {"crs": None, "radius": None, "geoid": None, "choices": SurfaceChoices()}
     errors: dict[str, SatIntervalsError] = {}
-    if any(pair.sensors for pair in pairs):
+    if any(pair.resolution for pair in pairs):
         import sat_intervals.heights.sensors  # noqa: F401 (without its extra it raises, for all pairs)
     _check_kept_by_all(pairs, out)
     for pair in pairs:
-        if not pair.sensors:
+        if not pair.resolution:
             continue
         of_pair = {"resolution": pair.resolution, **cells}
-        _check_kept(out / pair.name, of_pair, pair.sensors)
+        _check_kept(out / pair.name, of_pair, pair.sensors or ())
         try:
-            _check(of_pair, pair.sensors, None)
+            _check(of_pair, pair.sensors if _has_grids(pair) else None, None)
         except SatIntervalsError as error:
             errors[pair.name] = error
             click.echo(f"{pair.name}: there will be no surface: {error}", err=True)
 
     def surface_of(pair: "PairOfBatch", finished: str) -> dict[str, Any]:
-        if not pair.sensors:
+        if not pair.resolution:
             return {}
         if pair.name in errors:
             raise errors[pair.name]
@@ -185,3 +187,32 @@ def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -
         return {"surface": _surface(out / pair.name, pair.sensors, of_pair, console)}
 
     return surface_of
+
+
+def _has_grids(pair: "PairOfBatch") -> bool:
+    return len(pair.sensors or ()) > 2
+
+
+def epipolar_pairs(out: Path, console: "Console", *, overwrite: bool) -> "Begin":
+    """Return a function that makes the epipolar pair of a pair of a batch, if its row asks for a surface."""
+    from sat_intervals.tiling import Window
+
+    def epipolar(pair: "PairOfBatch") -> "PairOfBatch":
+        if not pair.resolution or _has_grids(pair):
+            return pair
+        kinds = (
+            (pair.reading.get(f"{side}_{what}", pair.reading.get(what)) for side in ("left", "right"))
+            for what in ("nodata", "band")
+        )
+        nodata, band = map(tuple, kinds)
+        window = Window(*pair.window) if pair.window else None
+        images = PairArguments((pair.left, pair.right), (pair.left_mask, pair.right_mask), nodata, band, window)
+        raw = {"dem": None, "altitude": None, "geoid": None, "resolution_of": "coarser"}
+        given = tuple(map(Path, pair.sensors or ()))
+        made, files = _epipolar(images, given, raw, out / pair.name, console, overwrite=overwrite)
+        left, right = made.images
+        masks = dict(zip(("left_mask", "right_mask"), made.masks, strict=True))
+        reading = pair.reading if made is images else {}
+        return replace(pair, left=left, right=right, **masks, reading=reading, sensors=tuple(map(str, files)))
+
+    return epipolar

@@ -328,3 +328,26 @@ def test_surface__of_a_model_that_is_off_recovers_the_rows_or_ends_with_one_line
     rows = np.median([look[2] for look in report["survey"]["rows"]["looks"]])
     assert rows == pytest.approx((3 + 1e-4 * 300) * np.cos(TURNS[1]), abs=0.1)
     refused(["surface", *far, tmp_path / "far_out", *SETTINGS], "epipolar pair")
+
+
+def test_batch__makes_surfaces_of_raw_pairs(made, raw, tmp_path):
+    left, right = raw
+    rows = [
+        {"name": "raw", "left": str(left), "right": str(right), "resolution": 0.5},
+        {"name": "given", "left": str(left), "right": str(right), "resolution": 0.5}
+        | {"left_model": str(left), "right_model": str(right)},
+        {"name": "made", "left": str(made / "left.tif"), "right": str(made / "right.tif"), "resolution": 0.5},
+        {"name": "wrong", "left": str(left), "right": str(made / "right.tif"), "resolution": 0.5},
+    ]
+    (tmp_path / "pairs.json").write_text(json.dumps(rows))
+    result = invoke("batch", tmp_path / "pairs.json", tmp_path / "out")
+    assert result.exit_code == 1
+    assert "1 of 4 pairs failed" in result.stderr
+    assert "made/out/right.tif has no RPC model" in result.stderr.replace(str(made), "made/out")
+    raw_surface, *others = (read_layers(tmp_path / "out" / name / "dsm.tif") for name in ("raw", "given", "made"))
+    for other in others:
+        assert_array_equal(raw_surface, other)
+    before = contents(tmp_path / "out" / "raw")
+    rerun = invoke("batch", tmp_path / "pairs.json", tmp_path / "out")
+    assert "resampling" not in rerun.output
+    assert contents(tmp_path / "out" / "raw") == before
