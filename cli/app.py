@@ -36,7 +36,7 @@ from sat_intervals.cli.triangulate import triangulate
 
 FAILED, USER_ERROR = 1, 2
 _ITEM = "\n  "
-RESUMED = ("match", "demo", "batch", "surface")
+RESUMED = ("match", "demo", "batch", "surface", "rectify")
 STEPS: dict[str, tuple[click.Command, ...]] = {
     "Try and prepare": (demo, search_range, plan, config),
     "Match": (match, batch, status),
