@@ -145,10 +145,10 @@ def _grid_writer(out: Path, geometry: "Epipolar") -> OutputWriter:
 def _write_images(
     writer: OutputWriter, images: "tuple[SensorImage, SensorImage]", geometry: "Epipolar", progress: Progress
 ) -> None:
-    from sat_intervals.heights.resampling import Resampled, nodata_of, resampled_strips
+    from sat_intervals.heights.resampling import Resampled, nodata_of, nodes_near, resampled_strips
 
     resampled = [
-        Resampled(one.image, nodes - one.origin - 0.5, scale, nodata_of(one.image))
+        Resampled(one.image, nodes_near(nodes - one.origin - 0.5, one.image, scale), scale, nodata_of(one.image))
         for one, nodes, scale in zip(images, (geometry.left, geometry.right), geometry.scales, strict=True)
     ]
     for row, strips in resampled_strips(resampled, geometry.height, geometry.width):

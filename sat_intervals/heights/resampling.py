@@ -14,6 +14,8 @@ from sat_intervals.tiling import Window
 
 # Columns of a tile, which is as high as a block of the files.
 _COLUMNS = 2 * BLOCK
+# Nodes from the image beyond which no pixel of it is between them.
+_FAR = 4
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,13 @@ class Resampled:
         window = Window(int(first[0]), int(first[1]), *map(int, last - first))
         inside = window.clipped(Window(0, 0, self.image.height, self.image.width))
         return window if inside.height and inside.width else None
+
+
+def nodes_near(nodes: np.ndarray, image: Image, scale: float) -> np.ndarray:
+    """Return nodes, NaN where no pixel of the image is near: windows stay small, whatever a model says out there."""
+    most = _FAR * STEP * scale
+    inside = (nodes >= -most) & (nodes <= np.array([image.height, image.width]) + most)
+    return np.where(inside.all(axis=-1, keepdims=True), nodes, np.nan)
 
 
 def nodata_of(image: Image) -> float:

@@ -351,3 +351,25 @@ def test_batch__makes_surfaces_of_raw_pairs(made, raw, tmp_path):
     rerun = invoke("batch", tmp_path / "pairs.json", tmp_path / "out")
     assert "resampling" not in rerun.output
     assert contents(tmp_path / "out" / "raw") == before
+
+
+def test_rectify__masks_grow_by_the_pixels_around_and_no_value_becomes_no_data(made, raw, tmp_path):
+    from sat_intervals.heights.resampling import stored
+
+    values = np.array([np.nan, -3.0, 0.4, 1.0, 254.6, 300.0])
+    assert_array_equal(stored(values, "uint8", 0.0), [0, 1, 1, 1, 255, 255])
+    assert_array_equal(stored(values, "uint8", 255.0), [255, 0, 0, 1, 254, 254])
+    assert_array_equal(stored(values, "float32", np.nan), values.astype(np.float32))
+    with rasterio.open(raw[0]) as dataset:
+        mask = np.zeros(dataset.shape, np.uint8)
+    mask[250:290, 250:300] = 1
+    kind = {"height": mask.shape[0], "width": mask.shape[1], "count": 1, "dtype": "uint8"}
+    with rasterio.open(tmp_path / "mask.tif", "w", driver="GTiff", **kind) as dataset:
+        dataset.write(mask, 1)
+    altitude = json.loads((made / "rectify.json").read_text())["altitude"]
+    words = "--left-mask", tmp_path / "mask.tif", "--altitude", altitude
+    assert invoke("rectify", *raw, tmp_path / "out", *words).exit_code == 0
+    before, after = (read_layers(folder / "left.tif")[0] for folder in (made, tmp_path / "out"))
+    lost = int(((before > 0) & (after == 0)).sum())
+    assert 43 * 53 - 60 <= lost <= 44 * 54 + 60  # a cubic needs one or two pixels on each side
+    assert_array_equal(before[after > 0], after[after > 0])
