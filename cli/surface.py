@@ -71,6 +71,7 @@ def surface(
         _check(cells, None, interval)
         raw |= {"geoid": cells["geoid"] if raw["dem"] else None}
         given = sensor_files[0] if sensor_files else ()
+        _check_kept(out, cells, [*given, *pair.files], settings.file)
         pair, files = _epipolar(pair, given, raw, out, console, overwrite=run.overwrite)
         _check(cells, files, interval)
         _check_kept(out, cells, [*files, *pair.files], settings.file)
