@@ -25,6 +25,7 @@ from sat_intervals.cli.plan import plan
 from sat_intervals.cli.plot import plot
 from sat_intervals.cli.project import project
 from sat_intervals.cli.range import search_range
+from sat_intervals.cli.rectify import rectify
 from sat_intervals.cli.reference import reference
 from sat_intervals.cli.report import report
 from sat_intervals.cli.signals import Ended, armed
@@ -37,12 +38,12 @@ FAILED, USER_ERROR = 1, 2
 # Packages of extras.
 _EXTRAS = {"matplotlib": "plot", "scipy": "dsm", "pyogrio": "reference", "shapely": "reference"}
 _ITEM = "\n  "
-RESUMED = ("match", "demo", "batch", "surface")
+RESUMED = ("match", "demo", "batch", "surface", "rectify")
 STEPS: dict[str, tuple[click.Command, ...]] = {
     "Try and prepare": (demo, search_range, plan, config),
     "Match": (match, batch, status),
     "Look": (plot, report, project),
-    "Heights": (surface, dsm, triangulate),
+    "Heights": (surface, rectify, dsm, triangulate),
     "Compare with a truth": (reference, evaluate, calibrate, ablate),
     "Use elsewhere": (export, stac),
 }

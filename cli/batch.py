@@ -20,15 +20,15 @@ def batch(pairs: Path, out: Path, as_json: bool, settings: SettingsArguments, ru
     """Match the PAIRS of a CSV, YAML or JSON file, each into its own folder in OUT.
 
     Columns: name, left, right, minimum, maximum, left_mask, right_mask, nodata, band, window, and any setting such as
-    sgm.p2. Rows with left_model, right_model, left_grid, right_grid and resolution also produce a surface model, as
-    `surface` does. A failed pair does not stop the others. OUT/batch.json has the state of each pair; the exit status
-    is 1 if any failed.
+    sgm.p2. Rows with resolution also produce a surface model, as `surface` does: of raw images with RPC models, or of
+    an epipolar pair with left_model, right_model, left_grid, right_grid. A failed pair does not stop the others.
+    OUT/batch.json has the state of each pair; the exit status is 1 if any failed.
     """
     from sat_intervals.cli.console import Console
-    from sat_intervals.cli.surface import surfaces_of
+    from sat_intervals.cli.surface import epipolar_pairs, surfaces_of
     from sat_intervals.config.pairs import REPORT, read_batch
     from sat_intervals.raster.identity import check_not_replaced
-    from sat_intervals.run.batch import match_batch
+    from sat_intervals.run.batch import Steps, match_batch
 
     check_not_replaced([pairs, settings.file], [out / REPORT])
     rows = read_batch(pairs)
@@ -41,7 +41,7 @@ def batch(pairs: Path, out: Path, as_json: bool, settings: SettingsArguments, ru
             overwrite=run.overwrite,
             keep_tiles=run.keep_tiles,
             progress=console.progress,
-            finish=surfaces_of(rows, out, console),
+            steps=Steps(epipolar_pairs(out, console, overwrite=run.overwrite), surfaces_of(rows, out, console)),
         )
     if as_json:
         say_json(report)

@@ -27,6 +27,7 @@ STAGES = {
     "bands": "postprocessing rows",
     "points": "triangulating rows",
     "geometry": "reading models and grids",
+    "resampling": "resampling rows",
     "cells": "filling rows of cells",
     "registration": "registering the reference",
     "reference": "reading points",

@@ -149,10 +149,11 @@ def dsm(
 ) -> None:
     """Make a surface model from the finished runs in the folders OUT.
 
-    Models are GeoTIFFs with RPC tags, .geom or DIMAP XML files. Grids contain the sensor column and row (bands 1 and 2)
-    of epipolar positions, as written by CARS and shareloc, or displacements to them, if OTB's tag METADATATYPE=OTB
-    says so. Give them once for each OUT: OUT/geometry.json names them for later commands. Swapping both models and
-    grids of left and right is not detected, and inverts the relief. Needs shareloc: pip install 'sat-intervals[dsm]'.
+    Models are GeoTIFF or NITF with RPC tags, .RPB, _RPC.TXT, .geom or DIMAP XML files. Grids contain the sensor column
+    and row (bands 1 and 2) of epipolar positions, as written by CARS and shareloc, or displacements to them, if OTB's
+    tag METADATATYPE=OTB says so. Give them once for each OUT: OUT/geometry.json names them for later commands. A pair
+    that `rectify` has made needs neither. Swapping both models and grids of left and right is not detected, and inverts
+    the relief. Needs shareloc: pip install 'sat-intervals[dsm]'.
 
     Bands: height, height_lower, height_upper, count, confidence, agreement. Heights refer to the WGS 84 ellipsoid
     unless --geoid is given. A point contributes to its cell and to cells whose centre is within --radius. Other cells

@@ -1,7 +1,7 @@
 """Options shared by the commands that match: the pair, its settings, the run."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -114,7 +114,7 @@ class _Both(click.ParamType):  # type: ignore[type-arg,unused-ignore]
         return left, right_or_left
 
 
-def _pair(
+def _images(
     *,
     left: str,
     right: str,
@@ -122,18 +122,21 @@ def _pair(
     right_mask: str | None,
     nodata: tuple[float, float] | None,
     band: tuple[int, int] | None,
-    window: tuple[int, int, int, int] | None,
 ) -> PairArguments:
+    nothing = (None, None)
+    return PairArguments((left, right), (left_mask, right_mask), nodata or nothing, band or nothing, None)
+
+
+def _with_window(*, pair: PairArguments, window: tuple[int, int, int, int] | None) -> PairArguments:
     from sat_intervals.tiling import Window
 
-    nothing, region = (None, None), Window(*window) if window else None
-    return PairArguments((left, right), (left_mask, right_mask), nodata or nothing, band or nothing, region)
+    return replace(pair, window=Window(*window) if window else None)
 
 
 # The command gets ``pair``.
-pair_options = gathered(
+image_options = gathered(
     "pair",
-    _pair,
+    _images,
     click.argument("left", type=NAME),
     click.argument("right", type=NAME),
     click.option("--left-mask", type=NAME, help="Mask of the left image: non-zero = masked."),
@@ -145,10 +148,15 @@ pair_options = gathered(
         help="No-data value of both images, or LEFT,RIGHT; replaces that of the files.",
     ),
     click.option("--band", type=_Both(int), metavar="N", help="Band to match in both images, or LEFT,RIGHT."),
-    click.option(
-        "--window", type=int, nargs=4, metavar="ROW COL HEIGHT WIDTH", help="Region of the left image to match."
-    ),
 )
+
+
+def pair_options(command: Command) -> Command:
+    """Add options for an epipolar pair and the region to match; the command gets ``pair``, a `PairArguments`."""
+    window = click.option(
+        "--window", type=int, nargs=4, metavar="ROW COL HEIGHT WIDTH", help="Region of the left image to match."
+    )
+    return image_options(gathered("pair", _with_window, window)(command))
 
 
 _LEVEL_OPTIONS = (

@@ -90,21 +90,27 @@ SensorFiles = tuple[Path, Path, Path, Path]
 """Left and right RPC model, left and right epipolar grid."""
 
 
-def _sensor_files(**given: tuple[Path, ...]) -> list[SensorFiles]:
+def _sensor_files(models_alone: bool, **given: tuple[Path, ...]) -> list[tuple[Path, ...]]:
+    if models_alone and not (given["left_grid"] or given["right_grid"]):
+        given = {name: files for name, files in given.items() if name.endswith("model")}
     if len({len(files) for files in given.values()}) > 1:
         options = ", ".join("--" + name.replace("_", "-") for name in given)
-        raise click.UsageError(f"{options} go together: give all four.")
+        raise click.UsageError(f"{options} go together: give {'both' if len(given) == 2 else 'all four'}.")
     return list(zip(*given.values(), strict=True))
 
 
-def sensor_options(command: Command) -> Command:
-    """Add options for models and grids, to be given once for each run; the command gets a list of `SensorFiles`."""
+def sensor_options(command: Command, *, models_alone: bool = False) -> Command:
+    """Add options for models and grids, to be given once for each run; the command gets a list of `SensorFiles`.
+
+    ``models_alone``: models may be given without grids; the list then has both models only.
+    """
     names = [f"{side}_{kind}" for kind in ("model", "grid") for side in ("left", "right")]
     texts = ("RPC model of the {} sensor image.", "Epipolar grid of the {} image.")
 
     @wraps(command)
     def with_files(**given: Any) -> Any:
-        return command(sensor_files=_sensor_files(**{name: given.pop(name) for name in names}), **given)
+        files = _sensor_files(models_alone, **{name: given.pop(name) for name in names})
+        return command(sensor_files=files, **given)
 
     options = (
         click.option("--" + name.replace("_", "-"), multiple=True, type=FILE, help=text.format(name.partition("_")[0]))

@@ -1,6 +1,8 @@
 """``sat-intervals surface``: from two epipolar images to a surface model in one command."""
 
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,13 +18,14 @@ from sat_intervals.cli.matching import (
     search_options,
 )
 from sat_intervals.cli.options import FILE, SensorFiles, json_option, note_geometry, say_json, sensor_options
+from sat_intervals.cli.rectify import raw_options, rectified
 from sat_intervals.cli.triangulate import geometry_warnings
 
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
     from sat_intervals.config import Interval
     from sat_intervals.config.pairs import PairOfBatch
-    from sat_intervals.run.batch import Finish
+    from sat_intervals.run.batch import Begin, Finish
 
 # What is made of a run, in its folder.
 _FILES = "geometry.json", "dsm.tif"
@@ -32,7 +35,8 @@ _FILES = "geometry.json", "dsm.tif"
 @search_options
 @pair_options
 @click.argument("out", type=FILE)
-@sensor_options
+@partial(sensor_options, models_alone=True)
+@raw_options
 @cell_options
 @calibration_option("--height-calibration")
 @json_option
@@ -40,28 +44,36 @@ _FILES = "geometry.json", "dsm.tif"
 def surface(
     pair: PairArguments,
     out: Path,
-    sensor_files: list[SensorFiles],
+    sensor_files: list[tuple[Path, ...]],
+    raw: dict[str, Any],
     cells: dict[str, Any],
     as_json: bool,
     settings: SettingsArguments,
     run: RunArguments,
 ) -> None:
-    """Match the epipolar images LEFT and RIGHT and write the surface model of the run to OUT/dsm.tif.
+    """Match the images LEFT and RIGHT and write the surface model to OUT/dsm.tif.
 
-    The same as `match` and `dsm`, with their options and files. To resume, rerun the same command: a finished match
-    with these images and settings is kept, the surface is made again.
+    LEFT and RIGHT are raw images with RPC models, or an epipolar pair with the models and grids of its raw images. Raw
+    images become the epipolar pair OUT/left.tif, OUT/right.tif, as by `rectify`; heights of --dem refer to --geoid.
+
+    The same as `rectify`, `match` and `dsm`, with their options and files. To resume, rerun the same command: what is
+    finished with these images and settings is kept, the surface is made again.
     """
     from sat_intervals.cli.console import Console
 
-    if len(sensor_files) != 1:
+    if len(sensor_files) > 1:
         raise click.UsageError("give --left-model, --right-model, --left-grid and --right-grid once.")
-    (files,) = sensor_files
-
     config = settings.load()
     with Console(run.quiet or as_json) as console:
         from sat_intervals.config import resolved
 
-        _check(cells, files, resolved(config).interval)
+        interval = resolved(config).interval
+        _check(cells, None, interval)
+        raw |= {"geoid": cells["geoid"] if raw["dem"] else None}
+        given = sensor_files[0] if sensor_files else ()
+        _check_kept(out, cells, [*given, *pair.files], settings.file)
+        pair, files = _epipolar(pair, given, raw, out, console, overwrite=run.overwrite)
+        _check(cells, files, interval)
         _check_kept(out, cells, [*files, *pair.files], settings.file)
         left, right = pair.open()
         report = run.match(left, right, out, config, window=pair.window, progress=console.progress)
@@ -72,6 +84,31 @@ def surface(
     say_surface(console, made)
     console.say(str(out / "dsm.tif"))
     run.check_strict([*report["warnings"], *geometry_warnings(made["geometry"])])
+
+
+def _epipolar(
+    pair: PairArguments,
+    given: Sequence[Path],
+    raw: dict[str, Any],
+    out: Path,
+    console: "Console",
+    *,
+    overwrite: bool,
+) -> tuple[PairArguments, SensorFiles]:
+    """Return an epipolar pair with its models and grids; raw images are rectified in the folder of the run."""
+    from sat_intervals.heights.rectified import GRIDS, IMAGES, rectified_files
+
+    if len(given) == 2 + len(GRIDS):
+        return pair, (given[0], given[1], given[2], given[3])
+    if not given and (made := rectified_files(*pair.images)):
+        return pair, made
+    if pair.window:
+        raise click.UsageError("--window is a region of an epipolar image: rectify these raw images, then match them.")
+    rectified(pair, out, tuple(given) or (None, None), raw, overwrite=overwrite, console=console, rows=False)
+    left, right = (str(out / name) for name in IMAGES)
+    made = rectified_files(left, right)
+    assert made
+    return PairArguments((left, right), (None, None), (None, None), (None, None), None), made
 
 
 def _check_kept(
@@ -95,7 +132,7 @@ def _check_kept_by_all(pairs: "Sequence[PairOfBatch]", out: Path) -> None:
     images = [file for pair in pairs for file in (pair.left, pair.right, pair.left_mask, pair.right_mask)]
     sensors = [file for pair in pairs for file in pair.sensors or ()]
     check_not_replaced(
-        [*images, *sensors], [out / pair.name / name for pair in pairs if pair.sensors for name in _FILES]
+        [*images, *sensors], [out / pair.name / name for pair in pairs if pair.resolution for name in _FILES]
     )
 
 
@@ -107,14 +144,15 @@ def _surface(out: Path, sensor_files: SensorFiles, cells: dict[str, Any], consol
     return make_surface([out], out / "dsm.tif", **cells, progress=console.progress)
 
 
-def _check(cells: dict[str, Any], sensor_files: Sequence[str | Path], interval: "Interval | None") -> None:
+def _check(cells: dict[str, Any], sensor_files: Sequence[str | Path] | None, interval: "Interval | None") -> None:
     """Raise for what the later steps cannot use, before hours of matching."""
     from sat_intervals.heights.dsm import checked_cells, surface_tags
     from sat_intervals.heights.sensors import Sensors
 
     _, cell, _, radius = checked_cells(*(cells[name] for name in ("resolution", "crs", "radius", "geoid")))
     surface_tags(["run"], [interval], cells["choices"].for_intervals([interval]), cell, radius)
-    Sensors.load(*map(Path, sensor_files))
+    if sensor_files:
+        Sensors.load(*map(Path, sensor_files))
 
 
 def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -> "Finish":
@@ -127,22 +165,22 @@ def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -
 
     cells = {"crs": None, "radius": None, "geoid": None, "choices": SurfaceChoices()}
     errors: dict[str, SatIntervalsError] = {}
-    if any(pair.sensors for pair in pairs):
+    if any(pair.resolution for pair in pairs):
         import sat_intervals.heights.sensors  # noqa: F401 (without its extra it raises, for all pairs)
     _check_kept_by_all(pairs, out)
     for pair in pairs:
-        if not pair.sensors:
+        if not pair.resolution:
             continue
         of_pair = {"resolution": pair.resolution, **cells}
-        _check_kept(out / pair.name, of_pair, pair.sensors)
+        _check_kept(out / pair.name, of_pair, pair.sensors or ())
         try:
-            _check(of_pair, pair.sensors, None)
+            _check(of_pair, pair.sensors if _has_grids(pair) else None, None)
         except SatIntervalsError as error:
             errors[pair.name] = error
             click.echo(f"{pair.name}: there will be no surface: {error}", err=True)
 
     def surface_of(pair: "PairOfBatch", finished: str) -> dict[str, Any]:
-        if not pair.sensors:
+        if not pair.resolution:
             return {}
         if pair.name in errors:
             raise errors[pair.name]
@@ -150,3 +188,32 @@ def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -
         return {"surface": _surface(out / pair.name, pair.sensors, of_pair, console)}
 
     return surface_of
+
+
+def _has_grids(pair: "PairOfBatch") -> bool:
+    return len(pair.sensors or ()) > 2
+
+
+def epipolar_pairs(out: Path, console: "Console", *, overwrite: bool) -> "Begin":
+    """Return a function that makes the epipolar pair of a pair of a batch, if its row asks for a surface."""
+    from sat_intervals.tiling import Window
+
+    def epipolar(pair: "PairOfBatch") -> "PairOfBatch":
+        if not pair.resolution or _has_grids(pair):
+            return pair
+        kinds = (
+            (pair.reading.get(f"{side}_{what}", pair.reading.get(what)) for side in ("left", "right"))
+            for what in ("nodata", "band")
+        )
+        nodata, band = map(tuple, kinds)
+        window = Window(*pair.window) if pair.window else None
+        images = PairArguments((pair.left, pair.right), (pair.left_mask, pair.right_mask), nodata, band, window)
+        raw = {"dem": None, "altitude": None, "geoid": None, "resolution_of": "coarser"}
+        given = tuple(map(Path, pair.sensors or ()))
+        made, files = _epipolar(images, given, raw, out / pair.name, console, overwrite=overwrite)
+        left, right = made.images
+        masks = dict(zip(("left_mask", "right_mask"), made.masks, strict=True))
+        reading = pair.reading if made is images else {}
+        return replace(pair, left=left, right=right, **masks, reading=reading, sensors=tuple(map(str, files)))
+
+    return epipolar

@@ -112,6 +112,9 @@ def test_commands__have_arguments_and_options_that_exist() -> None:
 # What a machine of tests lacks, or what takes long, and where it is tried instead.
 NOT_RUN = {
     "s3://": "tests/store/test_remote.py",
+    "LEFT.TIF": "tests/heights/test_rectify.py, with a raw pair made up",
+    "pair/left.tif": "likewise",
+    "dsm run/": "likewise",
     "--tune": "tests/run/test_calibrate.py",
     "lidar.tif": "tests/evaluate/test_dsm.py: there are no heights of others for the demo scene",
     "dsm one/": "tests/heights/test_dsm.py, with runs made up",

@@ -39,7 +39,7 @@ try:
 except SatIntervalsError as error:
     print(error)
 """
-    assert run_python(script) == "triangulation needs shareloc: pip install 'sat-intervals[dsm]'\n"
+    assert run_python(script) == "sensor models need shareloc: pip install 'sat-intervals[dsm]'\n"
 
 
 def test_packages__equal_the_folders() -> None:

@@ -63,8 +63,9 @@ class PairOfBatch:
     """One row of a batch: name, images, and the pair's own settings as nested sections.
 
     ``reading`` may have ``nodata`` and ``band`` for both images, ``left_nodata`` and so on for one; ``window`` is the
-    region of the left image to match: row, column, height, width. ``sensors`` are the models and grids of left and
-    right, and ``resolution`` the side of a cell in metres, of a pair whose surface model is made too.
+    region of the left image to match: row, column, height, width. ``resolution`` is the side of a cell in metres of a
+    pair whose surface model is made too, and ``sensors`` are its models and grids of left and right; of raw images
+    both models, or None if they belong to the images.
     """
 
     name: str
@@ -75,7 +76,7 @@ class PairOfBatch:
     settings: Mapping[str, Any] = field(default_factory=dict)
     reading: Mapping[str, Any] = field(default_factory=dict)
     window: tuple[int, int, int, int] | None = None
-    sensors: tuple[str, str, str, str] | None = None
+    sensors: tuple[str, ...] | None = None
     resolution: float | None = None
 
 
@@ -110,9 +111,9 @@ def read_batch(file: Path) -> list[PairOfBatch]:
 
     A row has ``name``, ``left`` and ``right``; ``minimum`` and ``maximum``, the search range; ``left_mask`` and
     ``right_mask``; ``nodata`` and ``band``, or ``left_nodata`` and so on; ``window``; ``left_model``, ``right_model``,
-    ``left_grid``, ``right_grid`` and ``resolution`` for a surface model; and any setting under its dotted name, such as
-    ``sgm.p2``. YAML and JSON hold a list of such rows, in which a setting may also be a section. Paths
-    are relative to the file.
+    ``left_grid``, ``right_grid`` and ``resolution`` for a surface model, of raw images without grids; and any setting
+    under its dotted name, such as ``sgm.p2``. YAML and JSON hold a list of such rows, in which a setting may also be a
+    section. Paths are relative to the file.
     """
     pairs = [_of_batch(place, row, file) for place, row in _rows(file, ("name", "left", "right"))]
     check_names((pair.name for pair in pairs), f"{file}: ")
@@ -215,14 +216,17 @@ def _of_batch(place: str, row: dict[str, Any], file: Path) -> PairOfBatch:
 
 def _surface(place: str, row: dict[str, Any], file: Path) -> dict[str, Any]:
     """Take what a surface model needs out of a row, all or nothing."""
-    needed = (*_SENSORS, "resolution")
-    missing = [key for key in needed if key not in row]
-    if len(missing) == len(needed):
+    given = {key: _relative_to(file, str(row.pop(key))) for key in _SENSORS if key in row}
+    resolution = _value(place, row, "resolution", float)
+    if not given and resolution is None:
         return {}
+    # raw images have no grids, and perhaps models beside them
+    needed = _SENSORS if any(key.endswith("grid") for key in given) else _SENSORS[:2] if given else ()
+    missing = [key for key in needed if key not in given] + ["resolution"] * (resolution is None)
     if missing:
+        needed = (*needed, "resolution")
         raise SatIntervalsError(f"{place} lacks {' and '.join(missing)}: a surface needs {', '.join(needed)}")
-    sensors = tuple(_relative_to(file, str(row.pop(key))) for key in _SENSORS)
-    return {"sensors": sensors, "resolution": _value(place, row, "resolution", float)}
+    return {"sensors": tuple(given.values()) or None, "resolution": resolution}
 
 
 def _relative_to(file: Path, path: str) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.heights.lattice import Lattice
+from sat_intervals.heights.rectified import rectified_files
 from sat_intervals.progress import Progress
 from sat_intervals.raster import write_file
 from sat_intervals.raster.identity import identity
@@ -48,7 +49,7 @@ def set_geometry(
     out
         Folder of the finished run, or the run as it was opened.
     left_model, right_model
-        RPC models of the sensor images: GeoTIFF with RPC tags, ``.geom`` or DIMAP XML.
+        RPC models of the sensor images: GeoTIFF or NITF with RPC tags, ``.RPB``, ``_RPC.TXT``, ``.geom`` or DIMAP XML.
     left_grid, right_grid
         Epipolar grids: band 1 is the sensor column, band 2 the sensor row. The geotransform gives the epipolar position
         of each node (convention of shareloc and CARS). Epipolar positions refer to the whole left image. Grids of OTB,
@@ -76,9 +77,15 @@ def set_geometry(
 
 
 def geometry_of(run: Run, progress: Progress = lambda stage, done, total: None) -> Geometry:
-    """Return the geometry of a run; raise if `set_geometry` was not called for it, or a file has changed since."""
+    """Return the geometry of a run; raise if `set_geometry` was not called for it, or a file has changed since.
+
+    That of a pair that `rectify` has made is set here.
+    """
     from sat_intervals.heights.sensors import lattice_of
 
+    images = (run.report["inputs"][side]["path"] for side in ("left", "right"))
+    if not (run.out / FILE).exists() and (made := rectified_files(*images)):
+        set_geometry(run, *made)
     paths = _noted(run)
     sensors, report = _sensors(run, paths)
     search = run.config.disparity

@@ -10,23 +10,20 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.errors import SatIntervalsError, check_file
+from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.lattice import Lattice
+from sat_intervals.heights.models import read_model, read_with  # raises without the extra `dsm`
 from sat_intervals.kernels.compiled import kernels_of_others
 from sat_intervals.kernels.rows import RowOffsets
 from sat_intervals.progress import Progress
 from sat_intervals.raster import GROUND, Georeferencing, between_180
 from sat_intervals.tiling import Window
 
-try:
-    with kernels_of_others():
-        from shareloc.geofunctions.rectification_grid import RectificationGrid
-        from shareloc.geofunctions.triangulation import epipolar_triangulation
-        from shareloc.geomodels import GeoModel
+with kernels_of_others():
+    from shareloc.geofunctions.rectification_grid import RectificationGrid
+    from shareloc.geofunctions.triangulation import epipolar_triangulation
 
-        from sat_intervals.heights.grids import read_grid
-except ModuleNotFoundError as error:
-    raise SatIntervalsError("triangulation needs shareloc: pip install 'sat-intervals[dsm]'") from error
+    from sat_intervals.heights.grids import read_grid
 
 # Pixels between nodes of the lattice: interpolation errors are below 1 mm.
 _SPACING = 32
@@ -62,10 +59,9 @@ class Sensors:
         left: Georeferencing | None = None,
         rows: RowOffsets | None = None,
     ) -> "Sensors":
-        """Read RPC models (GeoTIFF tags, ``.geom``, DIMAP XML) and epipolar grids, see `grids.read_grid`."""
-        model = partial(_read, kind="RPC model", reader=GeoModel)
-        grid = partial(_read, kind="epipolar grid", reader=partial(read_grid, left=left or Georeferencing()))
-        models = model(left_model), model(right_model)
+        """Read RPC models, see `models.read_model`, and epipolar grids, see `grids.read_grid`."""
+        grid = partial(read_with, kind="epipolar grid", reader=partial(read_grid, left=left or Georeferencing()))
+        models = read_model(left_model), read_model(right_model)
         return cls(*models, grid(left_grid), grid(right_grid), _turned(models), rows)
 
     def triangulate(self, row: np.ndarray, column: np.ndarray, disparity: np.ndarray) -> np.ndarray:
@@ -102,18 +98,6 @@ def _turned(models: Sequence[Any]) -> float:
     for model in models:
         model.offset_x = between_180(model.offset_x - turn)
     return turn
-
-
-def _read(path: Path, kind: str, reader: Any) -> Any:
-    check_file(path, f"give the {kind} of the image")
-    try:
-        with warnings.catch_warnings(action="ignore"):
-            return reader(str(path))
-    except SatIntervalsError:
-        raise
-    except Exception as error:  # shareloc, scipy and GDAL raise many types
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise SatIntervalsError(f"shareloc cannot read {path} as {kind}: {reason}") from error
 
 
 def lattice_of(

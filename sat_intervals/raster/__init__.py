@@ -21,6 +21,7 @@ from sat_intervals.raster.publishing import (
     part_bytes,
     write_file,
 )
+from sat_intervals.raster.rpc import find_model, read_rpc_file
 from sat_intervals.raster.surfaces import (
     check_reference,
     covered_window,
@@ -28,6 +29,7 @@ from sat_intervals.raster.surfaces import (
     read_heights,
     read_place,
     resolution_of,
+    window_of_ground,
 )
 from sat_intervals.raster.windows import Layer, read_small_image, read_small_layers, read_views, read_window
 from sat_intervals.raster.writer import OutputWriter
@@ -61,6 +63,7 @@ __all__ = [
     "factors",
     "file_bytes",
     "files_of",
+    "find_model",
     "footprint",
     "geoid_grid",
     "grid_mapping",
@@ -77,6 +80,7 @@ __all__ = [
     "read_known",
     "read_layers",
     "read_place",
+    "read_rpc_file",
     "read_shape",
     "read_small_image",
     "read_small_layers",
@@ -90,6 +94,7 @@ __all__ = [
     "truth_file",
     "utm_of",
     "warn_of_no_data",
+    "window_of_ground",
     "write_file",
     "write_layer",
 ]

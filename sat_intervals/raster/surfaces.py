@@ -111,3 +111,29 @@ def read_heights(
         except gdal.GDAL_ERRORS as error:
             raise SatIntervalsError(f"{path} cannot be resampled to the surface: {gdal.reason(error)}") from error
         return np.asarray(values * dataset.scales[0] + dataset.offsets[0])
+
+
+def window_of_ground(path: Path, bounds: tuple[float, float, float, float], around: float) -> Window:
+    """Return the window of a raster of heights that covers some ground and what is around it; raise if none does.
+
+    ``bounds``: least longitude and latitude, then the largest ones; ``around``: in degrees too.
+    """
+    _, place = read_place(path)
+    with opened(str(path)) as dataset:
+        west, south, east, north = bounds
+        window = dataset.window(*transform_bounds("EPSG:4326", place.crs, *bounds))
+        if not Window(0, 0, *dataset.shape).clipped(_around(window)) == _around(window):
+            raise SatIntervalsError(
+                f"{path} does not cover the images, at longitudes {west:.4f} to {east:.4f}, latitudes {south:.4f} to "
+                f"{north:.4f}: give a DEM that does"
+            )
+        grown = west - around, south - around, east + around, north + around
+        area = dataset.window(*transform_bounds("EPSG:4326", place.crs, *grown))
+        return _around(area).clipped(Window(0, 0, *dataset.shape))
+
+
+def _around(area: RasterioWindow) -> Window:
+    """Return the window of whole pixels around a part of a raster."""
+    first = floor(area.row_off), floor(area.col_off)
+    last = ceil(area.row_off + area.height), ceil(area.col_off + area.width)
+    return Window(*first, last[0] - first[0], last[1] - first[1])

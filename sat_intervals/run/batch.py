@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -40,7 +41,20 @@ from sat_intervals.tiling import Window
 
 _LOG = logging.getLogger(__name__)
 _KEPT = "finished", "counts", "seconds", "warnings"  # of a run's report, in `batch.json`
+Begin = Callable[[PairOfBatch], PairOfBatch]
 Finish = Callable[[PairOfBatch, str], Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class Steps:
+    """What is done with each pair besides matching.
+
+    ``begin`` returns the pair to match, such as that of two raw images. ``finish`` is called with it once it is
+    complete, and the time at which its run ended; what it returns is added to its state.
+    """
+
+    begin: Begin = lambda pair: pair
+    finish: Finish = lambda pair, ended: {}
 
 
 def match_batch(
@@ -52,14 +66,13 @@ def match_batch(
     overwrite: bool = False,
     keep_tiles: bool = False,
     progress: Progress = lambda stage, done, total: None,
-    finish: Finish = lambda pair, ended: {},
+    steps: Steps = Steps(),
 ) -> dict[str, dict[str, Any]]:
     """Match many pairs on one cluster; a failed pair does not stop the others.
 
     Each pair has a folder in ``out``. ``config`` and ``overrides`` are for all pairs; a pair's own settings win.
-    ``finish`` is called with each complete pair and the time at which its run ended; what it returns is added to its
-    state. Returns, as ``batch.json`` has it, by name: ``state`` ("waiting", "done", "done before", "failed"), and
-    ``error`` or ``finished``, ``counts``, ``seconds`` and ``warnings``.
+    Returns, as ``batch.json`` has it, by name: ``state`` ("waiting", "done", "done before", "failed"), and ``error`` or
+    ``finished``, ``counts``, ``seconds`` and ``warnings``.
     """
     file = Path(config) if isinstance(config, (str, Path)) else None
     sections = read_yaml(Path(config)) if isinstance(config, (str, Path)) else config  # once for all pairs
@@ -72,9 +85,11 @@ def match_batch(
         with Connection(common.cluster, out) as connection:
             find = Finder(connection, progress)
             jobs: dict[str, Job] = {}
-            for number, pair in enumerate(pairs):
+            begun: dict[str, PairOfBatch] = {}
+            for number, given in enumerate(pairs):
                 progress("pairs", number, len(pairs))
                 try:
+                    pair = begun[given.name] = steps.begin(given)
                     own = merged(overrides or {}, pair.settings)
                     settings = load_config(sections, own, preset_wins=True, file=file)
                     job = _prepared(pair, out, settings, overwrite=overwrite, find=find)
@@ -82,17 +97,15 @@ def match_batch(
                     if job.begin():
                         jobs[pair.name] = job
                     else:
-                        before = complete_before(job)
-                        end_tiles(job, keep_tiles=keep_tiles)
-                        report.note({pair.name: {"state": "done before"} | {key: before[key] for key in _KEPT}})
+                        report.note({pair.name: _done_before(job, keep_tiles=keep_tiles)})
                 except Exception as error:  # one pair's failure must not stop the others
-                    report.note({pair.name: _failed(error)})
+                    report.note({given.name: _failed(error)})
             progress("pairs", len(pairs), len(pairs))
             for name, how in _matched(jobs, connection, progress, keep_tiles=keep_tiles):
                 report.note({name: how})
-        for pair in pairs:
+        for pair in begun.values():
             how = report.states[pair.name]
-            if how["state"] != "failed" and (more := _more(pair, how["finished"], finish)):
+            if how["state"] != "failed" and (more := _more(pair, how["finished"], steps.finish)):
                 report.note({pair.name: {**how, **more}})
     return report.states
 
@@ -143,6 +156,12 @@ def _prepared(pair: PairOfBatch, out: Path, settings: Config, *, overwrite: bool
     return prepare(
         left, right, out / pair.name, settings, window=window, overwrite=overwrite, pair=pair.name, find=find
     )
+
+
+def _done_before(job: Job, *, keep_tiles: bool) -> dict[str, Any]:
+    before = complete_before(job)
+    end_tiles(job, keep_tiles=keep_tiles)
+    return {"state": "done before"} | {key: before[key] for key in _KEPT}
 
 
 def _failed(error: Exception) -> dict[str, Any]:

@@ -145,9 +145,7 @@ def test_match_arrays__refuses_integers_that_no_float_holds(sign):
 
 # ---- Maps and heights --------------------------------------------------------------------------------------------
 def test_projection__refuses_a_map_whose_metres_are_none():
-    with pytest.raises(
-        SatIntervalsError, match=r"a metre of EPSG:3857 is 0.724 m on the ground .* such as EPSG:32631"
-    ):
+    with pytest.raises(SatIntervalsError, match=r"a metre of EPSG:3857 is 0.724 m on the ground .* such as EPSG:32631"):
         Projection("EPSG:3857").check(1.4, 43.6)
     for crs in ("EPSG:32631", "EPSG:32632", "EPSG:2154"):
         Projection(crs).check(1.4, 43.6)

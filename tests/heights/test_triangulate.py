@@ -426,7 +426,7 @@ def test_batch_command__rows_with_models_and_grids_go_on_to_a_surface(tmp_path):
 
     for row, message in (
         (f"a,{images},{sensors},", "row 1 lacks resolution: a surface needs left_model"),
-        (f"a,{images},,,,,1", "row 1 lacks left_model and right_model and left_grid and right_grid: a surface needs"),
+        (f"a,{images},,,{files[2].name},,1", "row 1 lacks left_model and right_model and right_grid: a surface needs"),
         (f"a,{images},{sensors},wide", "row 1: resolution is 'wide'"),
     ):
         result = batch(row)

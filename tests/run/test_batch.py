@@ -23,7 +23,7 @@ from sat_intervals.match.memory import fitted, tile_bytes
 from sat_intervals.raster import write_layer
 from sat_intervals.results import open_run
 from sat_intervals.run import batch
-from sat_intervals.run.batch import match_batch
+from sat_intervals.run.batch import Steps, match_batch
 from sat_intervals.run.checks import fitted_to_jobs
 from sat_intervals.run.connection import Connection
 from sat_intervals.run.job import prepare
@@ -73,7 +73,7 @@ def test_match_batch__keeps_the_counts_of_a_pair_whose_last_step_fails(images, t
         raise SatIntervalsError("no model")
 
     pair = read_batch(rows(images))[0]
-    end = match_batch([pair], tmp_path / "batch", finish=finish)[pair.name]
+    end = match_batch([pair], tmp_path / "batch", steps=Steps(finish=finish))[pair.name]
     assert (end["state"], end["error"]) == ("failed", "no model")
     assert end["counts"] == json.loads((tmp_path / "batch" / pair.name / "run.json").read_text())["counts"]
 

@@ -1,0 +1,128 @@
+"""``sat-intervals rectify``: make an epipolar pair of two raw images."""
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from sat_intervals.cli.matching import PairArguments, image_options
+from sat_intervals.cli.options import (
+    FILE,
+    Command,
+    gathered,
+    json_option,
+    log_options,
+    overwrite_option,
+    quiet_option,
+    say_json,
+)
+
+if TYPE_CHECKING:
+    from sat_intervals.cli.console import Console
+
+
+def _raw(*, dem: Path | None, altitude: float | None, resolution_of: str) -> dict[str, Any]:
+    return {"dem": dem, "altitude": altitude, "resolution_of": resolution_of}
+
+
+def raw_options(command: Command) -> Command:
+    """Add options for the grids of a raw pair; the command gets ``raw``, their values."""
+    return gathered(
+        "raw",
+        _raw,
+        click.option("--dem", type=FILE, help="Raw images: DEM whose heights have disparity 0."),
+        click.option(
+            "--altitude",
+            type=float,
+            metavar="METRES",
+            help="Raw images: height above the ellipsoid that has disparity 0; default that of the largest overlap.",
+        ),
+        click.option(
+            "--resolution-of",
+            type=click.Choice(("coarser", "left")),
+            default="coarser",
+            help="Raw images: whose pixel size the epipolar images get, if they differ by more than 10 %.",
+        ),
+    )(command)
+
+
+@click.command(short_help="Make an epipolar pair of two raw images.")
+@image_options
+@click.argument("out", type=FILE)
+@click.option("--left-model", type=FILE, help="RPC model of the left image; default that in or beside it.")
+@click.option("--right-model", type=FILE, help="RPC model of the right image.")
+@raw_options
+@click.option("--geoid", type=FILE, help="Geoid grid that heights of --dem refer to; default the ellipsoid.")
+@overwrite_option
+@json_option
+@quiet_option
+@log_options
+def rectify(
+    pair: PairArguments,
+    out: Path,
+    left_model: Path | None,
+    right_model: Path | None,
+    raw: dict[str, Any],
+    geoid: Path | None,
+    overwrite: bool,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Resample the raw images LEFT and RIGHT, with RPC models, to an epipolar pair in the folder OUT.
+
+    \b
+    OUT/left.tif, right.tif            the overlap of the images
+    OUT/left_grid.tif, right_grid.tif  column and row in the raw image of
+                                       epipolar positions, as in CARS
+    OUT/rectify.json                   inputs, altitude, base-to-height ratio,
+                                       metres per pixel of disparity, rows
+
+    Then: sat-intervals match OUT/left.tif OUT/right.tif RUN, and dsm RUN, which finds models and grids by rectify.json.
+    `surface` does all of it. Models: RPC in tags of GeoTIFF or NITF, .RPB, _RPC.TXT, DIMAP XML, .geom.
+    Needs shareloc: pip install 'sat-intervals[dsm]'.
+    """  # noqa: D301 (click's mark of a preformatted paragraph)
+    from sat_intervals.cli.console import Console
+
+    with Console(quiet or as_json) as console:
+        models = left_model, right_model
+        record = rectified(pair, out, models, raw | {"geoid": geoid}, overwrite=overwrite, console=console, rows=True)
+    if as_json:
+        say_json(record)
+    for name in ("left.tif", "right.tif", "left_grid.tif", "right_grid.tif", "rectify.json"):
+        console.say(str(out / name))
+
+
+def rectified(
+    pair: PairArguments,
+    out: Path,
+    models: tuple[Path | None, Path | None],
+    raw: dict[str, Any],
+    *,
+    overwrite: bool,
+    console: "Console",
+    rows: bool,
+) -> dict[str, Any]:
+    """Rectify a pair and print its figures; ``rows``: compare the rows of the new images, too."""
+    from sat_intervals.heights.epipolar import Terrain
+    from sat_intervals.heights.rectify import RawPair, rectify
+    from sat_intervals.run.rows import compared_rows
+
+    left, right = pair.open()
+    terrain = Terrain(raw["dem"], raw["altitude"], raw["geoid"])
+    raw_pair = RawPair(left, right, models, terrain, raw["resolution_of"])
+    compare = partial(compared_rows, progress=console.progress) if rows else None
+    record = rectify(raw_pair, out, overwrite=overwrite, compare=compare, progress=console.progress)
+    for side in ("left", "right"):
+        console.say(f"model of the {side} image: {record['inputs'][f'{side}_model']['path']}")
+    height = "a DEM" if record["altitude"] is None else f"{record['altitude']:.0f} m"
+    console.say(
+        f"disparity 0 at {height}, {-record['metres_per_disparity']:.2f} m a pixel; base-to-height ratio "
+        f"{record['base_to_height']:.2f}, pixels of {record['pixel_size']:.2f} m, "
+        f"{100 * record['overlap']:.0f} % overlap"
+    )
+    if found := record["rows"]:
+        console.say(f"rows: {found['text']}")
+        for line in found["warnings"]:
+            click.echo(f"warning: {line}", err=True)
+    return record

@@ -1,0 +1,180 @@
+"""Epipolar grids of a raw pair: where it overlaps, at which height, how large pixels are, and the grids of shareloc."""
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from sat_intervals.errors import SatIntervalsError, check_file
+from sat_intervals.heights.models import SensorImage, common_parts, shares_at
+from sat_intervals.kernels.compiled import kernels_of_others
+from sat_intervals.raster import Georeferencing, window_of_ground
+from sat_intervals.tiling import Window
+
+with kernels_of_others():
+    from affine import Affine
+    from shareloc.dtm_reader import dtm_reader
+    from shareloc.geofunctions.dtm_intersection import DTMIntersection
+    from shareloc.geofunctions.rectification import compute_stereorectification_epipolar_grids
+    from shareloc.proj_utils import coordinates_conversion
+
+# Pixels between nodes, and nodes beyond the images, as in CARS.
+STEP, MARGIN = 30, 2
+# Pixels around the overlap, for ground that is higher or lower than the height of the grids.
+_BEYOND = 60
+# Heights that are tried, and the share of the largest overlap that is as good.
+_HEIGHTS, _AS_GOOD = 64, 0.99
+# Ratio of pixel sizes up to which they are equal: the cubic then needs no smoothing.
+_EQUAL = 1.1
+# Base-to-height ratio below which a pixel of disparity is more than 25 m in an image of .5 m.
+_LEAST_BASE = 0.02
+# Degrees of a DEM around the overlap.
+_AROUND = 0.02
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """The height at which disparities are 0: a DEM, above a geoid or the ellipsoid, or metres; by default found."""
+
+    dem: Path | None = None
+    altitude: float | None = None
+    geoid: Path | None = None
+
+    def check(self) -> None:
+        """Raise for what does not go together, or is missing."""
+        if self.dem and self.altitude is not None:
+            raise SatIntervalsError(f"the DEM {self.dem} and an altitude of {self.altitude:g} m are given: give one")
+        if self.geoid and not self.dem:
+            raise SatIntervalsError(f"the geoid {self.geoid} is given without a DEM: leave it out, or give --dem")
+        for file in filter(None, (self.dem, self.geoid)):
+            check_file(file, "give a raster of heights")
+
+
+@dataclass(frozen=True)
+class Epipolar:
+    """Grids of a pair and their figures.
+
+    Attributes
+    ----------
+    left, right
+        ``(n, m, 2)`` float64, row and column of the nodes in the whole sensor images (first pixel centre at 0.5).
+    height, width
+        Size of both epipolar images; the first pixel is `MARGIN` nodes from the first node.
+    scales
+        Sensor pixels per epipolar pixel of the left and the right image, 1 if they are nearly as large.
+    figures
+        ``altitude`` (metres, None with a DEM), ``overlap`` (share of the left image), ``pixel_size`` (metres),
+        ``base_to_height``, ``metres_per_disparity``, ``footprint`` (longitude and latitude of the corners).
+    """
+
+    left: np.ndarray
+    right: np.ndarray
+    height: int
+    width: int
+    scales: tuple[float, float]
+    figures: dict[str, Any]
+
+
+def grid_place() -> Georeferencing:
+    """Return the georeferencing of the files of grids: epipolar positions of their cells' centres."""
+    first = -(MARGIN + 0.5) * STEP
+    return Georeferencing(transform=Affine(STEP, 0, first, 0, STEP, first))
+
+
+def epipolar_geometry(left: SensorImage, right: SensorImage, terrain: Terrain, resolution_of: str) -> Epipolar:
+    """Return the grids of the overlap of a raw pair; raise if there is none, or no base."""
+    height = likely_height(left, right) if terrain.altitude is None else terrain.altitude
+    for one in (left, right):
+        one.check_height(height)
+    elevation = _dem(left, right, terrain.dem, terrain.geoid, height) if terrain.dem else height
+    share, parts = common_parts(left, right, elevation, _BEYOND)
+    if parts is None:
+        raise SatIntervalsError(
+            f"{left.image.path} and {right.image.path} do not overlap at {height:.0f} m above the ellipsoid: give "
+            "images of one place, their models, or another --altitude"
+        )
+    sizes = [_pixel_size(one, part, height) for one, part in zip((left, right), parts, strict=True)]
+    ratio = sizes[1] / sizes[0]
+    spacing = ratio if resolution_of == "coarser" and ratio > _EQUAL else 1.0
+    nodes, shape, base = shareloc_grids((left, right), parts, elevation, spacing)
+    base_to_height = base * sizes[0]
+    if not base_to_height >= _LEAST_BASE:
+        raise SatIntervalsError(
+            f"{left.image.path} and {right.image.path} have a base-to-height ratio of {base_to_height:.3f}: heights "
+            f"need at least {_LEAST_BASE:g}: give another pair"
+        )
+    left_scale, right_scale = (scale if scale > _EQUAL else 1.0 for scale in (spacing, spacing / ratio))
+    figures = {
+        "altitude": None if terrain.dem else round(height, 3),
+        "overlap": round(share, 4),
+        "pixel_size": round(spacing * sizes[0], 4),
+        "base_to_height": round(base_to_height, 4),
+        "metres_per_disparity": round(-spacing / base, 4),
+        "footprint": _footprint(left, nodes[0], shape, height),
+    }
+    return Epipolar(*nodes, *shape, (left_scale, right_scale), figures)
+
+
+def likely_height(left: SensorImage, right: SensorImage) -> float:
+    """Return the height in the domain of both models at which most of the left image is on the right one."""
+    lowest, highest = max(left.heights[0], right.heights[0]), min(left.heights[1], right.heights[1])
+    heights = np.linspace(lowest, max(lowest, highest), _HEIGHTS)
+    shares = shares_at(left, right, heights)
+    return float(heights[shares >= _AS_GOOD * shares.max()].mean())
+
+
+def shareloc_grids(
+    images: tuple[SensorImage, SensorImage], parts: tuple[Window, Window], elevation: Any, spacing: float = 1.0
+) -> tuple[tuple[np.ndarray, np.ndarray], tuple[int, int], float]:
+    """Return grids over parts of both images, rows and columns, and pixels of the left image per metre of height."""
+    areas = [
+        SimpleNamespace(
+            transform=Affine.translation(one.origin[1] + part.column, one.origin[0] + part.row),
+            nb_rows=part.height,
+            nb_columns=part.width,
+            pixel_size_row=spacing,
+            pixel_size_col=spacing,
+        )
+        for one, part in zip(images, parts, strict=True)
+    ]
+    with warnings.catch_warnings(action="ignore"):
+        left, right, shape, base = compute_stereorectification_epipolar_grids(
+            areas[0], images[0].model, areas[1], images[1].model, elevation, epi_step=STEP, margin=MARGIN
+        )
+    nodes = np.ascontiguousarray(left[..., :2]), np.ascontiguousarray(right[..., :2])
+    return nodes, (int(shape[0]), int(shape[1])), float(base)
+
+
+def _pixel_size(of: SensorImage, part: Window, height: float) -> float:
+    """Return the side in metres of a pixel in the middle of a part of an image, as large on the ground."""
+    row = of.origin[0] + part.row + part.height / 2 + np.array([0.0, 1.0, 0.0])
+    column = of.origin[1] + part.column + part.width / 2 + np.array([0.0, 0.0, 1.0])
+    corner, down, across = coordinates_conversion(of.model.direct_loc_h(row, column, height), 4326, 4978)
+    return float(np.sqrt(np.linalg.norm(np.cross(down - corner, across - corner))))
+
+
+def _footprint(left: SensorImage, nodes: np.ndarray, shape: tuple[int, int], height: float) -> list[list[float]]:
+    """Return longitude and latitude of the corners of the epipolar image, by the nodes next to them."""
+    ends = [(MARGIN, MARGIN + round(size / STEP)) for size in shape]
+    corners = nodes[[ends[0][0], ends[0][1], ends[0][1], ends[0][0]], [ends[1][0], ends[1][0], ends[1][1], ends[1][1]]]
+    ground = left.model.direct_loc_h(corners[:, 0], corners[:, 1], height)
+    return [[round(float(value), 7) for value in corner[:2]] for corner in ground]
+
+
+def _dem(left: SensorImage, right: SensorImage, dem: Path, geoid: Path | None, height: float) -> Any:
+    """Return the DEM around the overlap as shareloc reads it, or its only height; raise if it does not cover it."""
+    _, parts = common_parts(left, right, height, _BEYOND)
+    part = parts[0] if parts else Window(0, 0, left.image.height, left.image.width)
+    rows = left.origin[0] + part.row + np.array([0.0, 0.0, part.height, part.height])
+    columns = left.origin[1] + part.column + np.array([0.0, part.width, 0.0, part.width])
+    ground = left.model.direct_loc_h(rows, columns, height)[:, :2]
+    window = window_of_ground(dem, (*ground.min(axis=0), *ground.max(axis=0)), _AROUND)
+    roi = [window.row, window.column, window.row_stop, window.column_stop]
+    with warnings.catch_warnings(action="ignore"):
+        read = dtm_reader(str(dem), geoid and str(geoid), roi=roi)
+    if not np.ptp(read.alt_data):  # the sea: shareloc finds no points on one height
+        return float(read.alt_data.flat[0])
+    return DTMIntersection(read.epsg, read.alt_data, read.nb_rows, read.nb_columns, read.transform)

@@ -1,0 +1,157 @@
+"""Make an epipolar pair of two raw images, with its grids and a record of how it was made: ``rectify.json``."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sat_intervals.errors import ChangedInputError, SatIntervalsError
+from sat_intervals.heights.rectified import FILE, GRIDS, IMAGES, read_record
+from sat_intervals.products import Band
+from sat_intervals.progress import Progress
+from sat_intervals.raster import File, Georeferencing, Image, OutputWriter, check_not_replaced, describe
+from sat_intervals.raster.identity import identity
+from sat_intervals.raster.publishing import check_free, write_file
+from sat_intervals.store.lock import locked
+from sat_intervals.store.manifest import differences
+
+if TYPE_CHECKING:
+    from sat_intervals.heights.epipolar import Epipolar, Terrain
+    from sat_intervals.heights.models import SensorImage
+
+_GREY = (Band("grey level", "", "grey level of the raw image, resampled to epipolar geometry (cubic)"),)
+_NODES = (
+    Band("column", "px", "column in the raw image of an epipolar position, first pixel centre at 0.5"),
+    Band("row", "px", "row in the raw image of an epipolar position, first pixel centre at 0.5"),
+)
+_TAGS = {"SOFTWARE": "sat-intervals"}
+
+Compare = Callable[[Path, Path], dict[str, Any]]
+"""Compares the rows of two epipolar images; what it returns is recorded."""
+
+
+@dataclass(frozen=True)
+class RawPair:
+    """Two raw images, their models (None: those that belong to them), and what they are resampled to."""
+
+    left: Image
+    right: Image
+    models: tuple[Path | None, Path | None]
+    terrain: "Terrain"
+    resolution_of: str = "coarser"
+
+
+def rectify(
+    pair: RawPair,
+    out: Path,
+    *,
+    overwrite: bool = False,
+    compare: Compare | None = None,
+    progress: Progress = lambda stage, done, total: None,
+) -> dict[str, Any]:
+    """Write ``left.tif``, ``right.tif``, ``left_grid.tif``, ``right_grid.tif`` and ``rectify.json`` to a folder.
+
+    Returns the content of ``rectify.json``; nothing is done if the folder has that of the same inputs and settings.
+    """
+    from sat_intervals.heights.models import SensorImage
+
+    pair.terrain.check()
+    progress("geometry", 0, 1)
+    left, right = (SensorImage.of(*one) for one in zip((pair.left, pair.right), pair.models, strict=True))
+    with locked(out):
+        before = read_record(out) or {}
+        asked = _asked(pair, left, right, before.get("inputs", {}))
+        if not _is_needed(out, asked, before, overwrite=overwrite):
+            return before
+        from sat_intervals.heights.epipolar import epipolar_geometry
+
+        geometry = epipolar_geometry(left, right, pair.terrain, pair.resolution_of)
+        # from now on, files in the folder may be what a death of this command has left
+        write_file(out / FILE, json.dumps(asked | {"finished": None}, indent=1).encode())
+        with _writer(out, pair, geometry) as images, _grid_writer(out, geometry) as grids:
+            _write_images(images, (left, right), geometry, progress)
+            grids.write(0, *(np.moveaxis(nodes[..., ::-1], -1, 0) for nodes in (geometry.left, geometry.right)))
+            if changes := list(differences(asked, _asked(pair, left, right, asked["inputs"]))):
+                raise ChangedInputError(f"an input was changed meanwhile ({'; '.join(changes)}): rerun the command")
+            images.publish()
+            grids.publish()
+        record = asked | geometry.figures
+        record["bounds"] = "the upper bound of the disparity is the lower height"
+        record["rows"] = compare(*(out / name for name in IMAGES)) if compare else None
+        record["finished"] = datetime.now(UTC).isoformat(timespec="seconds")
+        write_file(out / FILE, (json.dumps(record, indent=1) + "\n").encode())
+    return record
+
+
+def _asked(pair: RawPair, left: "SensorImage", right: "SensorImage", known: dict[str, Any]) -> dict[str, Any]:
+    """Return inputs and settings, as ``rectify.json`` has them; ``known`` are earlier inputs."""
+    files = {file["path"]: file for one in known.values() for file in (one, *one.get("files", ()))}
+    inputs = {
+        "left": describe(pair.left, files),
+        "right": describe(pair.right, files),
+        "left_model": identity(left.file, files),
+        "right_model": identity(right.file, files),
+    }
+    terrain = pair.terrain
+    given = (("dem", terrain.dem), ("geoid", terrain.geoid))
+    inputs |= {name: identity(str(file), files) for name, file in given if file}
+    settings = {"altitude": terrain.altitude, "resolution_of": pair.resolution_of}
+    asked = {"software": f"sat-intervals {version('sat-intervals')}", "inputs": inputs, "settings": settings}
+    content: dict[str, Any] = json.loads(json.dumps(asked))
+    return content
+
+
+def _is_needed(out: Path, asked: dict[str, Any], before: dict[str, Any], *, overwrite: bool) -> bool:
+    """Return whether there is something to do; raise if files in the folder are not of this pair."""
+    files = [out / name for name in (*IMAGES, *GRIDS)]
+    read = [file["path"] for one in asked["inputs"].values() for file in (one, *one.get("files", ()))]
+    check_not_replaced(read, [*files, out / FILE])
+    changes = list(differences({name: before.get(name) for name in asked}, asked)) if before else []
+    if before.get("finished") and not changes and all(file.exists() for file in files):
+        return False
+    if changes and not overwrite:
+        raise SatIntervalsError(
+            f"{out} already holds a pair made otherwise: {'; '.join(changes)}: choose another folder or --overwrite"
+        )
+    if not before:
+        for file in (*files, out / FILE):
+            check_free(file, overwrite=overwrite)
+    return True
+
+
+def _writer(out: Path, pair: RawPair, geometry: "Epipolar") -> OutputWriter:
+    from sat_intervals.heights.resampling import nodata_of
+
+    files = [
+        File(name, image.dtype, nodata_of(image), _GREY)
+        for name, image in zip(IMAGES, (pair.left, pair.right), strict=True)
+    ]
+    return OutputWriter(out, files, geometry.height, geometry.width, Georeferencing(), _TAGS)
+
+
+def _grid_writer(out: Path, geometry: "Epipolar") -> OutputWriter:
+    from sat_intervals.heights.epipolar import grid_place
+
+    rows, columns, _ = geometry.left.shape
+    files = [File(name, "float64", None, _NODES) for name in GRIDS]
+    return OutputWriter(out, files, rows, columns, grid_place(), _TAGS)
+
+
+def _write_images(
+    writer: OutputWriter, images: "tuple[SensorImage, SensorImage]", geometry: "Epipolar", progress: Progress
+) -> None:
+    from sat_intervals.heights.resampling import Resampled, nodata_of, nodes_near, resampled_strips
+
+    resampled = [
+        Resampled(one.image, nodes_near(nodes - one.origin - 0.5, one.image, scale), scale, nodata_of(one.image))
+        for one, nodes, scale in zip(images, (geometry.left, geometry.right), geometry.scales, strict=True)
+    ]
+    for row, strips in resampled_strips(resampled, geometry.height, geometry.width):
+        progress("resampling", row, geometry.height)
+        writer.write(row, *strips)
+    progress("resampling", geometry.height, geometry.height)

@@ -1,0 +1,103 @@
+"""Resample the images of a raw pair by strips, on all cores of this machine."""
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from sat_intervals.heights.epipolar import MARGIN, STEP
+from sat_intervals.kernels.resampling import reach, resample, resample_reduced
+from sat_intervals.machine import usable_cores
+from sat_intervals.raster import BLOCK, Image, read_window
+from sat_intervals.tiling import Window
+
+# Columns of a tile, which is as high as a block of the files.
+_COLUMNS = 2 * BLOCK
+# Nodes from the image beyond which no pixel of it is between them.
+_FAR = 4
+
+
+@dataclass(frozen=True)
+class Resampled:
+    """An image and the positions of its epipolar pixels.
+
+    Attributes
+    ----------
+    nodes
+        ``(n, m, 2)`` rows and columns in the image, pixel centres are integers; see `epipolar.Epipolar` for the rest.
+    nodata
+        What pixels without a value get; pixels of this value are written one grey level away.
+    """
+
+    image: Image
+    nodes: np.ndarray
+    scale: float
+    nodata: float
+
+    def read(self, window: Window) -> np.ndarray:
+        """Return a window of the epipolar image in the image's type."""
+        first = window.row + MARGIN * STEP, window.column + MARGIN * STEP
+        rows, columns = (
+            slice(start // STEP, (start + size - 1) // STEP + 2)
+            for start, size in zip(first, (window.height, window.width), strict=True)
+        )
+        around = self._around(self.nodes[rows, columns])
+        if around is None:
+            return np.full((window.height, window.width), self.nodata, self.image.dtype)
+        pixels, state = read_window(self.image, around)
+        pixels[state != 0] = np.nan
+        arguments = pixels, (around.row, around.column), self.nodes, STEP, first, window.height, window.width
+        values = resample(*arguments) if self.scale == 1 else resample_reduced(*arguments, self.scale)
+        return stored(values, self.image.dtype, self.nodata)
+
+    def _around(self, nodes: np.ndarray) -> Window | None:
+        """Return the window of the image that is needed at positions; None if all of them are outside."""
+        places = nodes[np.isfinite(nodes).all(axis=-1)]
+        if not places.size:
+            return None
+        before, after = reach(self.scale)
+        first = np.floor(places.min(axis=0)).astype(int) - before
+        last = np.floor(places.max(axis=0)).astype(int) + after + 1
+        window = Window(int(first[0]), int(first[1]), *map(int, last - first))
+        inside = window.clipped(Window(0, 0, self.image.height, self.image.width))
+        return window if inside.height and inside.width else None
+
+
+def nodes_near(nodes: np.ndarray, image: Image, scale: float) -> np.ndarray:
+    """Return nodes, NaN where no pixel of the image is near: windows stay small, whatever a model says out there."""
+    most = _FAR * STEP * scale
+    inside = (nodes >= -most) & (nodes <= np.array([image.height, image.width]) + most)
+    return np.where(inside.all(axis=-1, keepdims=True), nodes, np.nan)
+
+
+def nodata_of(image: Image) -> float:
+    """Return the no-data value of an image if its type holds it, else NaN or 0."""
+    if np.dtype(image.dtype).kind == "f":
+        return float("nan")
+    limits = np.iinfo(image.dtype)
+    return image.nodata if image.nodata is not None and limits.min <= image.nodata <= limits.max else 0.0
+
+
+def stored(values: np.ndarray, dtype: str, nodata: float) -> np.ndarray:
+    """Return values in a type, clipped to its range; NaN is no data, and no value is."""
+    if np.dtype(dtype).kind == "f":
+        return values.astype(dtype)
+    limits = np.iinfo(dtype)
+    unknown = np.isnan(values)
+    values = np.clip(np.rint(values), limits.min, limits.max)
+    values[values == nodata] += -1 if nodata == limits.max else 1
+    values[unknown] = nodata
+    return values.astype(dtype)
+
+
+def resampled_strips(images: Sequence[Resampled], height: int, width: int) -> Iterator[tuple[int, list[np.ndarray]]]:
+    """Yield strips of all images with their first rows, from the top."""
+    with ThreadPoolExecutor(usable_cores()) as threads:
+        for row in range(0, height, BLOCK):
+            windows = [
+                Window(row, column, min(BLOCK, height - row), min(_COLUMNS, width - column))
+                for column in range(0, width, _COLUMNS)
+            ]
+            futures = [[threads.submit(image.read, window) for window in windows] for image in images]
+            yield row, [np.concatenate([future.result() for future in of_image], axis=1) for of_image in futures]

@@ -1,0 +1,32 @@
+"""Compare the rows of an epipolar pair on this machine."""
+
+from pathlib import Path
+from typing import Any
+
+from sat_intervals.match.search_range import NoRangeError
+from sat_intervals.progress import Progress
+from sat_intervals.raster import open_image
+from sat_intervals.run.quality import rows_left
+from sat_intervals.run.search_range import finder_here
+from sat_intervals.tiling import Window
+
+
+def compared_rows(left: Path, right: Path, progress: Progress) -> dict[str, Any]:
+    """Return how far rows of a pair differ: ``text``, ``warnings`` (lines), ``search`` (range) and ``survey``."""
+    images = open_image(left), open_image(right)
+    with finder_here(progress) as finder:
+        try:
+            found = finder.search_range(*images)
+        except NoRangeError as error:
+            return {"text": "not compared: too few matches", "warnings": [str(error)], "search": None, "survey": None}
+        search = found.minimum, found.maximum
+        survey = finder.survey(*images, Window(0, 0, images[0].height, images[0].width), search)
+    text = "not compared: too few matches"
+    if rows := survey.rows:
+        does = "match takes them out" if survey.is_large and not rows.contradiction else "left as they are"
+        text = (
+            f"offsets of {rows.before[0]:.2f} px in the median, up to {rows.most:.2f} px; {does}; a smooth function "
+            f"leaves {rows.after[0]:.2f} px on other matches"
+        )
+    warnings = rows_left(survey, "auto", str(right))
+    return {"text": text, "warnings": warnings, "search": search, "survey": survey.report()}

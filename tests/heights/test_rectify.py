@@ -1,0 +1,374 @@
+"""Raw pairs to epipolar pairs and surfaces: grids, images, models, and what is refused."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import rasterio
+from helpers import contents, invoke, refused
+from numpy.testing import assert_allclose, assert_array_equal
+from rasterio.shutil import copy
+from rasterio.transform import Affine
+
+from sat_intervals.demo import make_scene
+from sat_intervals.raster import open_image, read_layers
+
+pytestmark = [
+    pytest.mark.peer("shareloc"),
+    pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning"),
+]
+
+SETTINGS = "--resolution", 0.5, "--crs", "EPSG:32631"
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene(400, 500, seed=3)
+
+
+@pytest.fixture(scope="module")
+def raw(tmp_path_factory, scene):
+    from raw import raw_pair
+
+    return raw_pair(tmp_path_factory.mktemp("raw") / "pair", scene)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory, raw):
+    """A folder of `rectify`."""
+    out = tmp_path_factory.mktemp("made") / "out"
+    result = invoke("rectify", *raw, out)
+    assert result.exit_code == 0, result.output
+    return out
+
+
+def sensor_images(folder):
+    from sat_intervals.heights.models import SensorImage
+
+    return [SensorImage.of(open_image(folder / f"{side}.tif"), None) for side in ("left", "right")]
+
+
+def errors_of(dsm, scene):
+    """Heights of a surface minus those of the scene, at its left pixels."""
+    from raw import heights_of
+
+    x, y, height = heights_of(scene)
+    with rasterio.open(dsm) as dataset:
+        column, row = (np.floor(place).astype(int) for place in ~dataset.transform * (x, y))
+        inside = (row >= 0) & (column >= 0) & (row < dataset.height) & (column < dataset.width)
+        bands = dataset.read((1, 2, 3))[:, row[inside], column[inside]]
+    known = np.isfinite(bands[0])
+    return bands[:, known] - height[inside][known]
+
+
+def test_grids__equal_those_of_shareloc(shared_data):
+    from sat_intervals.heights.epipolar import shareloc_grids
+    from sat_intervals.tiling import Window
+
+    pair = sensor_images(shared_data / "raw_picanteo_pre")
+    grids, shape, base = shareloc_grids(pair, (Window(0, 0, 1000, 1000),) * 2, 706.0)
+    assert shape == (1216, 1262)
+    assert base == pytest.approx(1 / 1.7128, abs=1e-3)  # metres_per_disparity of its meta.json
+    for side, nodes in zip(("left", "right"), grids, strict=True):
+        published = read_layers(shared_data / "dsm_picanteo" / f"{side}_grid.tif")
+        assert_allclose(np.moveaxis(nodes[..., ::-1], -1, 0), published, rtol=0, atol=1e-6)
+
+
+def test_images__equal_those_that_another_program_resampled_by_these_grids(shared_data):
+    from sat_intervals.heights.resampling import Resampled
+    from sat_intervals.tiling import Window
+
+    for one, side in zip(sensor_images(shared_data / "raw_picanteo_pre"), ("left", "right"), strict=True):
+        row, column = read_layers(shared_data / "dsm_picanteo" / f"{side}_grid.tif")[::-1]
+        nodes = np.stack([row, column], axis=-1) - one.origin - 0.5
+        found = Resampled(one.image, nodes, 1.0, 0.0).read(Window(400, 400, 400, 400)).astype(float)
+        lanczos = read_layers(shared_data / "dsm_picanteo" / f"{side}.tif")[0, 400:800, 400:800].astype(float)
+        down, across = np.gradient(lanczos)
+        design = np.stack([values.ravel() for values in (down, across, lanczos, np.ones_like(lanczos))], axis=1)
+        shift = np.linalg.lstsq(design, found.ravel(), rcond=None)[0][:2]
+        assert np.abs(shift).max() < 0.02
+
+
+@pytest.mark.parametrize("data", ["scene", "shared"])
+def test_grids__rows_of_points_at_five_heights_are_equal(data, raw, request):
+    from sat_intervals.heights.epipolar import MARGIN, STEP, Terrain, epipolar_geometry
+
+    is_scene = data == "scene"
+    folder = raw[0].parent if is_scene else request.getfixturevalue("shared_data") / "raw_picanteo_pre"
+    left, right = sensor_images(folder)
+    geometry = epipolar_geometry(left, right, Terrain(), "coarser")
+    rows, columns = np.indices(geometry.left.shape[:2])[:, MARGIN:-MARGIN, MARGIN:-MARGIN]
+    nodes = geometry.left[MARGIN:-MARGIN, MARGIN:-MARGIN].reshape(-1, 2)
+    for height in (-10, 0, 12, 30, 60) if is_scene else (600, 650, 706, 750, 900):
+        ground = left.model.direct_loc_h(nodes[:, 0], nodes[:, 1], float(height))
+        there = np.stack(right.model.inverse_loc(*ground.T)[:2], axis=-1)
+        # Newton steps through the grid of the right image, from the row and column of the left one
+        place = np.stack([rows.ravel(), columns.ravel()], axis=-1).astype(float)
+        for _ in range(8):
+            i, j = np.clip(np.floor(place).astype(int), 0, np.array(geometry.right.shape[:2]) - 2).T
+            corner, below, beside = geometry.right[i, j], geometry.right[i + 1, j], geometry.right[i, j + 1]
+            slopes = np.stack([below - corner, beside - corner], axis=-1)
+            place = np.stack([i, j], axis=-1) + np.linalg.solve(slopes, (there - corner)[..., None])[..., 0]
+        inside = (place >= 0).all(axis=1) & (place < np.array(geometry.right.shape[:2]) - 1).all(axis=1)
+        assert inside.mean() > 0.5
+        assert np.abs((place[:, 0] - rows.ravel()) * STEP)[inside].max() < 0.01
+
+
+def test_rectify__makes_the_overlap_and_a_record(made, raw):
+    record = json.loads((made / "rectify.json").read_text())
+    assert record["altitude"] == pytest.approx(12, abs=8)
+    assert record["base_to_height"] == pytest.approx(0.5, abs=0.005)  # VIEWS differ by 1 px of .5 m a metre
+    assert record["metres_per_disparity"] == pytest.approx(-1, abs=0.01)
+    assert record["pixel_size"] == pytest.approx(0.5, abs=0.005)
+    assert record["rows"]["survey"]["rows"]["before"][0] < 0.1
+    assert [record["inputs"][f"{side}_model"]["path"] for side in ("left", "right")] == [str(file) for file in raw]
+    for side in ("left", "right"):
+        with rasterio.open(made / f"{side}.tif") as dataset:
+            assert dataset.dtypes == ("uint16",)
+            assert dataset.nodata == 0
+            assert max(dataset.shape) < 760
+            assert dataset.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+            assert (dataset.read(1) > 0).mean() > 0.3  # the raw images have empty corners
+    (left_longitude, left_latitude), *_ = record["footprint"]
+    assert (left_longitude, left_latitude) == pytest.approx((1.45, 43.6), abs=0.005)
+
+
+def test_rectify__is_done_once_and_refuses_other_settings(made, raw):
+    before = contents(made)
+    assert invoke("rectify", *raw, made).exit_code == 0
+    assert contents(made) == before
+    refused(["rectify", *raw, made, "--altitude", 20], "settings.altitude was null, now 20.0", "--overwrite")
+    refused(["rectify", made / "left.tif", made / "right.tif", made], "has no RPC model")
+
+
+def test_rectify__resumes_what_a_death_left_and_keeps_files_of_others(made, raw, tmp_path):
+    out = shutil.copytree(made, tmp_path / "died")
+    record = json.loads((out / "rectify.json").read_text())
+    (out / "rectify.json").write_text(json.dumps(record | {"finished": None}))
+    refused(["surface", out / "left.tif", out / "right.tif", tmp_path / "run", *SETTINGS], "unfinished pair")
+    (out / "right.tif").unlink()
+    assert invoke("rectify", *raw, out).exit_code == 0
+    for name in ("left.tif", "right.tif", "left_grid.tif", "right_grid.tif"):
+        assert (out / name).read_bytes() == (made / name).read_bytes()
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "left_grid.tif").write_text("mine")
+    refused(["rectify", *raw, tmp_path / "other"], "left_grid.tif exists")
+    assert (tmp_path / "other" / "left_grid.tif").read_text() == "mine"
+
+
+@pytest.mark.parametrize("kind", ["RPB", "RPCTXT", "geom"])
+def test_models__of_all_files_give_the_same_images(kind, made, raw, tmp_path):
+    from sat_intervals.heights.models import read_model
+
+    pair = []
+    for file in raw:
+        pair.append(tmp_path / file.name)
+        if kind == "geom":
+            _without_tags(file, pair[-1])
+            _write_geom(file, pair[-1].with_suffix(".geom"))
+        else:
+            copy(str(file), str(pair[-1]), driver="GTiff", PROFILE="BASELINE", **{kind: "YES"})
+            with rasterio.open(pair[-1], "r+") as dataset:
+                dataset.nodata = 0
+    end = {"RPB": ".RPB", "RPCTXT": "_RPC.TXT", "geom": ".geom"}[kind]
+    models = [file.with_name(file.stem + end) for file in pair]
+    result = invoke("rectify", *pair, tmp_path / "found")
+    assert all(
+        f"model of the {side} image: {file}\n" in result.output
+        for side, file in zip(("left", "right"), models, strict=True)
+    )
+    assert_array_equal(read_layers(tmp_path / "found" / "left.tif"), read_layers(made / "left.tif"))
+    # the same function reads those of `surface`, `dsm` and `triangulate`
+    place = np.array([1.451]), np.array([43.599]), np.array([30.0])
+    for model, file in zip(models, raw, strict=True):
+        assert_allclose(read_model(model).inverse_loc(*place), read_model(file).inverse_loc(*place), rtol=0, atol=1e-9)
+
+
+def _without_tags(file, path):
+    with rasterio.open(file) as dataset:
+        pixels, profile = dataset.read(), dataset.profile
+    with rasterio.open(path, "w", **profile) as dataset:
+        dataset.write(pixels)
+
+
+def _write_geom(file, path):
+    with rasterio.open(file) as dataset:
+        known = dataset.rpcs.to_dict()
+    names = [f"{axis}_{what}" for axis in ("line", "samp", "lat", "long", "height") for what in ("off", "scale")]
+    lines = ["type:  ossimRpcModel", *(f"{name}:  {known[name]!r}" for name in names)]
+    for name in ("line_num_coeff", "line_den_coeff", "samp_num_coeff", "samp_den_coeff"):
+        lines += [f"{name}_{i:02}:  {value!r}" for i, value in enumerate(known[name])]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def test_rectify__places_a_crop_by_its_geotransform(made, raw, tmp_path):
+    crop = tmp_path / "left.tif"
+    with rasterio.open(raw[0]) as dataset:
+        pixels, profile = dataset.read(1)[100:400, 80:500], dataset.profile
+    profile |= {"height": 300, "width": 420, "transform": Affine.translation(80, 100)}
+    with rasterio.open(crop, "w", **profile) as dataset:
+        dataset.write(pixels, 1)
+    altitude = json.loads((made / "rectify.json").read_text())["altitude"]
+    given = ["--left-model", raw[0], "--altitude", altitude]
+    assert invoke("rectify", crop, raw[1], tmp_path / "out", *given).exit_code == 0
+    whole, part = (read_layers(folder / "left_grid.tif") for folder in (made, tmp_path / "out"))
+    # the epipolar position of the part's first pixel in the whole pair
+    (column, row), slopes = whole[:, 2, 2], (whole[:, 3, 2] - whole[:, 2, 2], whole[:, 2, 3] - whole[:, 2, 2])
+    offset = np.linalg.solve(np.stack(slopes, axis=1), part[:, 2, 2] - (column, row)) * 30
+    first = np.rint(offset).astype(int)
+    common = read_layers(tmp_path / "out" / "left.tif")[0][250:350, 270:400].astype(float)
+    there = read_layers(made / "left.tif")[0][first[0] + 250 :, first[1] + 270 :][:100, :130].astype(float)
+    assert np.corrcoef(common.ravel(), there.ravel())[0, 1] > 0.9  # half a pixel off at most
+
+
+def test_rectify__takes_the_coarser_pixels(raw, tmp_path):
+    coarse = tmp_path / "right.tif"
+    with rasterio.open(raw[1]) as dataset:
+        pixels, rpcs = dataset.read(1).astype(float), dataset.rpcs.to_dict()
+    height, width = (size // 2 for size in pixels.shape)
+    pixels = pixels[: 2 * height, : 2 * width].reshape(height, 2, width, 2).mean(axis=(1, 3))
+    for axis in ("line", "samp"):  # the centre of the first pixel moves from .5 to .25 of a pixel
+        rpcs |= {f"{axis}_off": (rpcs[f"{axis}_off"] + 0.5) / 2 - 0.5, f"{axis}_scale": rpcs[f"{axis}_scale"] / 2}
+    kind = {"height": height, "width": width, "count": 1, "dtype": "uint16", "nodata": 0}
+    with rasterio.open(coarse, "w", driver="GTiff", rpcs=rasterio.rpc.RPC(**rpcs), **kind) as dataset:
+        dataset.write(pixels.round().astype(np.uint16), 1)
+    assert invoke("rectify", raw[0], coarse, tmp_path / "coarser").exit_code == 0
+    record = json.loads((tmp_path / "coarser" / "rectify.json").read_text())
+    assert record["pixel_size"] == pytest.approx(1, abs=0.01)
+    assert record["rows"]["survey"]["rows"]["before"][0] < 0.1
+    assert invoke("rectify", raw[0], coarse, tmp_path / "left", "--resolution-of", "left").exit_code == 0
+    assert json.loads((tmp_path / "left" / "rectify.json").read_text())["pixel_size"] == pytest.approx(0.5, abs=0.005)
+
+
+def test_rectify__follows_a_dem(raw, tmp_path):
+    from surfaces import write_raster
+
+    from sat_intervals.heights.epipolar import Terrain, epipolar_geometry
+
+    def dem(name, slope, west=1.42):
+        heights = 20.0 + slope * np.broadcast_to(np.arange(-30, 30), (1, 60, 60))
+        return write_raster(tmp_path / name, heights, Affine(0.001, 0, west, 0, -0.001, 43.63), "EPSG:4326")
+
+    flat, plane = (
+        epipolar_geometry(*sensor_images(raw[0].parent), terrain, "coarser")
+        for terrain in (Terrain(dem("flat.tif", 0.0)), Terrain(altitude=20.0))
+    )
+    assert_allclose(flat.right, plane.right, rtol=0, atol=1e-6)
+    assert invoke("rectify", *raw, tmp_path / "slope", "--dem", dem("slope.tif", 0.5)).exit_code == 0
+    record = json.loads((tmp_path / "slope" / "rectify.json").read_text())
+    assert record["altitude"] is None
+    assert record["rows"]["survey"]["rows"]["before"][0] < 0.1
+    refused(
+        ["rectify", *raw, tmp_path / "cut", "--dem", dem("cut.tif", 0.0, 1.451)], "cut.tif does not cover the images"
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "parts"),
+    [
+        (["--altitude", 500], ["height 500 m", "-48 to 72 m"]),
+        (["--altitude", 20, "--dem", "dem.tif"], ["give one"]),
+        (["--geoid", "geoid.tif"], ["without a DEM"]),
+        (["--left-model", "none.RPB"], ["none.RPB: no such file"]),
+        (["--right-model", "map.tif"], ["map.tif", "RPC model"]),
+    ],
+)
+def test_rectify__refuses_in_one_line(options, parts, raw, tmp_path, monkeypatch):
+    from surfaces import write_raster
+
+    monkeypatch.chdir(tmp_path)
+    for name in ("dem.tif", "geoid.tif", "map.tif"):
+        write_raster(tmp_path / name, np.full((1, 4, 4), 20.0))
+    refused(["rectify", *raw, tmp_path / "out", *options], *parts)
+
+
+def test_rectify__refuses_images_of_a_map_of_other_places_and_without_base(raw, tmp_path):
+    with rasterio.open(raw[0]) as dataset:
+        pixels, profile, rpcs = dataset.read(), dataset.profile, dataset.rpcs.to_dict()
+    for name, changes in (
+        ("map", {"crs": "EPSG:32631", "transform": Affine(0.5, 0, 370_000, 0, -0.5, 4_830_000)}),
+        ("away", {"rpcs": rasterio.rpc.RPC(**rpcs | {"long_off": rpcs["long_off"] + 0.008})}),
+        ("nan", {"rpcs": rasterio.rpc.RPC(**rpcs | {"line_num_coeff": [float("nan")] * 20})}),
+    ):
+        with rasterio.open(tmp_path / f"{name}.tif", "w", **{"rpcs": dataset.rpcs} | profile | changes) as written:
+            written.write(pixels)
+    refused(
+        ["rectify", tmp_path / "map.tif", raw[1], tmp_path / "out", "--left-model", raw[0]], "is on a map (EPSG:32631)"
+    )
+    refused(["rectify", tmp_path / "away.tif", raw[1], tmp_path / "out"], "do not overlap")
+    refused(["rectify", raw[0], raw[0], tmp_path / "out"], "base-to-height ratio")
+    refused(["rectify", tmp_path / "nan.tif", raw[1], tmp_path / "out"], "nan.tif", "no numbers")
+    assert not list((tmp_path / "out").glob("*.tif"))
+
+
+def test_surface__of_raw_images_has_the_heights_of_the_scene_and_later_commands_find_the_grids(raw, scene, tmp_path):
+    out = tmp_path / "out"
+    result = invoke("surface", *raw, out, *SETTINGS)
+    assert result.exit_code == 0, result.output
+    error, below, above = errors_of(out / "dsm.tif", scene)
+    assert abs(np.median(error)) < 0.1  # a pixel of disparity is 1 m
+    assert ((below <= 0) & (above >= 0)).mean() > 0.85
+    before = (out / "dsm.tif").read_bytes()
+    again = invoke("surface", *raw, out, *SETTINGS)
+    assert again.exit_code == 0
+    assert "resampling" not in again.output
+    assert (out / "dsm.tif").read_bytes() == before
+    run = tmp_path / "run"
+    assert invoke("match", out / "left.tif", out / "right.tif", run).exit_code == 0
+    assert invoke("dsm", run, *SETTINGS).exit_code == 0
+    assert_array_equal(read_layers(run / "dsm.tif"), read_layers(out / "dsm.tif"))
+    assert invoke("surface", out / "left.tif", out / "right.tif", run, *SETTINGS).exit_code == 0
+
+
+def test_surface__of_a_model_that_is_off_recovers_the_rows_or_ends_with_one_line(scene, tmp_path):
+    from raw import TURNS, raw_pair
+
+    near, far = raw_pair(tmp_path / "near", scene, off=3, slope=1e-4), raw_pair(tmp_path / "far", scene, off=30)
+    assert invoke("surface", *near, tmp_path / "out", *SETTINGS).exit_code == 0
+    report = json.loads((tmp_path / "out" / "run.json").read_text())
+    rows = np.median([look[2] for look in report["survey"]["rows"]["looks"]])
+    assert rows == pytest.approx((3 + 1e-4 * 300) * np.cos(TURNS[1]), abs=0.1)
+    refused(["surface", *far, tmp_path / "far_out", *SETTINGS], "epipolar pair")
+
+
+def test_batch__makes_surfaces_of_raw_pairs(made, raw, tmp_path):
+    left, right = raw
+    rows = [
+        {"name": "raw", "left": str(left), "right": str(right), "resolution": 0.5},
+        {"name": "given", "left": str(left), "right": str(right), "resolution": 0.5}
+        | {"left_model": str(left), "right_model": str(right)},
+        {"name": "wrong", "left": str(left), "right": str(made / "right.tif"), "resolution": 0.5},
+    ]
+    (tmp_path / "pairs.json").write_text(json.dumps(rows))
+    result = invoke("batch", tmp_path / "pairs.json", tmp_path / "out")
+    assert result.exit_code == 1
+    assert "1 of 3 pairs failed" in result.stderr
+    assert "made/out/right.tif has no RPC model" in result.stderr.replace(str(made), "made/out")
+    assert_array_equal(*(read_layers(tmp_path / "out" / name / "dsm.tif") for name in ("raw", "given")))
+    before = contents(tmp_path / "out" / "raw")
+    rerun = invoke("batch", tmp_path / "pairs.json", tmp_path / "out")
+    assert "resampling" not in rerun.output
+    assert contents(tmp_path / "out" / "raw") == before
+
+
+def test_rectify__masks_grow_by_the_pixels_around_and_no_value_becomes_no_data(made, raw, tmp_path):
+    from sat_intervals.heights.resampling import stored
+
+    values = np.array([np.nan, -3.0, 0.4, 1.0, 254.6, 300.0])
+    assert_array_equal(stored(values, "uint8", 0.0), [0, 1, 1, 1, 255, 255])
+    assert_array_equal(stored(values, "uint8", 255.0), [255, 0, 0, 1, 254, 254])
+    assert_array_equal(stored(values, "float32", np.nan), values.astype(np.float32))
+    with rasterio.open(raw[0]) as dataset:
+        mask = np.zeros(dataset.shape, np.uint8)
+    mask[250:290, 250:300] = 1
+    kind = {"height": mask.shape[0], "width": mask.shape[1], "count": 1, "dtype": "uint8"}
+    with rasterio.open(tmp_path / "mask.tif", "w", driver="GTiff", **kind) as dataset:
+        dataset.write(mask, 1)
+    altitude = json.loads((made / "rectify.json").read_text())["altitude"]
+    words = "--left-mask", tmp_path / "mask.tif", "--altitude", altitude
+    assert invoke("rectify", *raw, tmp_path / "out", *words).exit_code == 0
+    before, after = (read_layers(folder / "left.tif")[0] for folder in (made, tmp_path / "out"))
+    lost = int(((before > 0) & (after == 0)).sum())
+    assert 43 * 53 - 60 <= lost <= 44 * 54 + 60  # a cubic needs one or two pixels on each side
+    assert_array_equal(before[after > 0], after[after > 0])
