@@ -12,13 +12,13 @@ import xarray as xr
 from sat_intervals.config import Config, load_config, resolved, unreached
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.rows import RowOffsets, shift_rows
+from sat_intervals.match.labelled import labelled
 from sat_intervals.match.memory import check_memory, volume_bytes
 from sat_intervals.match.normalization import Moments, PairStatistics, blocks, moments, statistics_of
 from sat_intervals.match.rows import Survey
 from sat_intervals.match.sampling import look, spots
 from sat_intervals.match.search_range import Found, NoRangeError, find_range, finest_step, reduced, with_range
 from sat_intervals.match.whole import cut, match_whole, whole_view
-from sat_intervals.products import flag_attributes, interval_bands
 from sat_intervals.tiling import Window
 
 _LOG = logging.getLogger(__name__)
@@ -75,13 +75,7 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
         statistics = PairStatistics(*(statistics_of(_moments(image)) for image in images))
     final = match_whole(*images, config, statistics, ranges)
     labels = left if isinstance(left, xr.DataArray) else xr.DataArray(images[0], dims=("row", "column"))
-    dataset = xr.Dataset(coords=labels.coords, attrs={"rows": json.dumps(asdict(rows))} if rows else {})
-    layers = (*final[:4], final.sigma) if config.products.sigma else final[:4]
-    for band, layer in zip(interval_bands(sigma=config.products.sigma), layers, strict=True):
-        attributes = {"long_name": band.meaning} | ({"units": band.unit} if band.unit else {})
-        dataset[band.name] = xr.DataArray(layer, dims=labels.dims, attrs=attributes)
-    dataset["validity"] = xr.DataArray(final.validity, dims=labels.dims, attrs=flag_attributes())
-    return dataset
+    return labelled(final, labels, config, {"rows": json.dumps(asdict(rows))} if rows else {})
 
 
 def _pixels(array: Array, side: str) -> np.ma.MaskedArray:

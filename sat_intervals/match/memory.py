@@ -40,7 +40,7 @@ def tiles_together(config: Config, size: int) -> int:
 
 def volume_bytes(height: int, width: int, config: Config) -> int:
     """Bytes of the cost volume, the largest part of matching, and of precomputed matching costs."""
-    return (3 if config.cost.precomputed else 2) * height * width * padded_to_lanes(config.disparity.count)
+    return (2 + config.cost.precomputed) * height * width * padded_to_lanes(config.disparity.count)
 
 
 def tile_bytes(config: Config, size: int | None = None) -> int:
@@ -53,7 +53,7 @@ def tile_bytes(config: Config, size: int | None = None) -> int:
     if accurate:
         volume = 2 * size * (size + config.disparity.count) * lanes  # the volume of the right view is wider
     if config.cost.precomputed:
-        volume += lanes * patch * (patch + accurate * (patch + config.disparity.count))
+        volume += config.cost.precomputed * lanes * patch * (patch + accurate * (patch + config.disparity.count))
     if isinstance(config.cost, Mccnn):
         volume += _NETWORK_BYTES * (patch + config.disparity.count)
     paths = 2 * 3 * (patch + config.disparity.count) * lanes
