@@ -16,7 +16,7 @@ if typing.TYPE_CHECKING:
     from sat_intervals.heights.geometry import set_geometry
     from sat_intervals.heights.triangulate import triangulate
     from sat_intervals.interop.dataset import decode_flags, open
-    from sat_intervals.match.in_memory import match_arrays
+    from sat_intervals.match.in_memory import intervals_around, match_arrays
     from sat_intervals.match.volumes import intervals_of
     from sat_intervals.raster import open_image
     from sat_intervals.run.pair import match_pair
@@ -32,6 +32,7 @@ __all__ = [
     "__version__",
     "decode_flags",
     "evaluate_run",
+    "intervals_around",
     "intervals_of",
     "load_config",
     "make_surface",
@@ -52,6 +53,7 @@ _HOMES = {
     "Window": "tiling",
     "decode_flags": "interop.dataset",
     "evaluate_run": "evaluate.disparity",
+    "intervals_around": "match.in_memory",
     "intervals_of": "match.volumes",
     "load_config": "config",
     "make_surface": "heights.dsm",

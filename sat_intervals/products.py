@@ -1,5 +1,6 @@
 """Define the data dictionary: bands, validity flags and the states of an input pixel."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -90,12 +91,15 @@ BANDS = (
     Band("confidence", "", "confidence from ambiguity, 0 to 1, high = unambiguous"),
 )
 
-_SIGMA = Band("sigma", "px", "standard deviation of the least-squares fit of the disparity, no data without one")
+_EXTRA = (
+    Band("sigma", "px", "standard deviation of the least-squares fit of the disparity, no data without one"),
+    Band("agreement", "", "1 where the disparity that was given is in the interval, 0 where not; no data without both"),
+)
 
 
-def interval_bands(*, sigma: bool) -> tuple[Band, ...]:
-    """Return the bands of a run, with a fifth one of deviations if they are asked for."""
-    return (*BANDS, _SIGMA) if sigma else BANDS
+def interval_bands(extra: Collection[str] = ()) -> tuple[Band, ...]:
+    """Return the bands of a run, with those of ``sigma`` and ``agreement`` that are asked for."""
+    return *BANDS, *(band for band in _EXTRA if band.name in extra)
 
 
 class Bands(NamedTuple):
@@ -109,6 +113,7 @@ class Bands(NamedTuple):
     truth: np.ndarray = np.empty((0, 0))  # true disparity in pixels, floats, NaN where unknown; empty if not read
     image: np.ndarray = np.empty((0, 0))  # grey values of the left image, floats, NaN where no data; empty if not read
     sigma: np.ndarray = np.empty((0, 0))  # float32 pixels, NaN without a fit; empty if not asked for
+    agreement: np.ndarray = np.empty((0, 0))  # float32, 1, 0 or NaN; empty if not asked for
 
     @property
     def valid(self) -> np.ndarray:

@@ -95,10 +95,15 @@ class Disparity(Section):
         None, description="raster of two bands, minimum and maximum, for local ranges; null: found from the images"
     )
 
+    around: AbsolutePath | None = Field(
+        None, description="raster of another matcher's disparities, band 1, to search around and to audit; or null"
+    )
+    margin: int = Field(8, ge=1, le=1000, description="pixels searched on both sides of what around has in a cell")
+
     @property
     def is_local(self) -> bool:
         """Return whether cells have ranges of their own."""
-        return self.local or self.grid is not None
+        return self.local or self.grid is not None or self.around is not None
 
     @property
     def is_auto(self) -> bool:
@@ -120,6 +125,8 @@ class Disparity(Section):
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
+        if self.around is not None and (self.local or self.grid is not None):
+            raise ValueError("around gives local ranges of its own: leave out local and grid")
         if isinstance(self.minimum, str) != isinstance(self.maximum, str):
             raise ValueError(f"minimum is {self.minimum}, maximum is {self.maximum}: give two numbers, or auto twice")
         if not self.is_auto and self.minimum > self.maximum:

@@ -170,6 +170,12 @@ class Config(Section):
         return self.tiles.overlap == "exact" and self.sgm is not None
 
     @property
+    def extra_bands(self) -> tuple[str, ...]:
+        """Return the bands after those of every run, see `interval_bands`."""
+        asked = {"sigma": self.products.sigma, "agreement": self.disparity.around is not None}
+        return tuple(name for name, is_asked in asked.items() if is_asked)
+
+    @property
     def opens_ends(self) -> bool:
         """Return whether intervals at the ends of the search range are open, with confidence 0."""
         return self.disparity.open_ends or self.has_coverage

@@ -76,7 +76,7 @@ def waiting_bytes(config: Config, size: int | None = None) -> int:
 def strip_bytes(rows: int, width: int, config: Config) -> int:
     """Bytes that finishing a strip of final rows needs on top of its process."""
     piece = (_PIECE_BYTES + config.fits * _FIT_BYTES) * max(STRIP_PIXELS, _PIECE_ROWS * width)
-    bands, facing = rows * width * (_BAND_BYTES + 6 * config.products.sigma), width + config.disparity.count
+    bands, facing = rows * width * (_BAND_BYTES + 6 * len(config.extra_bands)), width + config.disparity.count
     writing = bands // 2 + rows * min(width, _COLUMNS) * _BLOCK_BYTES
     reading = rows * facing * _READING_BYTES if config.fits and config.rows == "auto" else 0
     return max(reading, bands + config.fits * rows * facing * _IMAGES_BYTES + piece, bands + writing)

@@ -78,7 +78,7 @@ def intervals_of(
     settings = resolved(volume_config(foreign, config))
     flags = flags_of(valid, foreign.shape)
     rows, settings = matched_volume(foreign, flags, right, settings)
-    return labelled(_in_pixels(finish_whole(rows, settings), foreign, settings), foreign.labels, settings, {})
+    return labelled(_in_pixels(finish_whole(rows, settings), foreign, settings), foreign.labels, {})
 
 
 def volume_config(foreign: Foreign, config: Config | Mapping[str, Any] | None) -> Config:
@@ -86,7 +86,7 @@ def volume_config(foreign: Foreign, config: Config | Mapping[str, Any] | None) -
     given: Any = config if isinstance(config, Config) else {"preset": "paper", **(config or {})}
     sgm = {"sgm": given["sgm"]} if isinstance(config, Mapping) and "sgm" in config else {}
     first = foreign.first_index
-    search = {"minimum": first, "maximum": first + foreign.shape[2] - 1, "local": False, "grid": None}
+    search = {"minimum": first, "maximum": first + foreign.shape[2] - 1, "local": False, "grid": None, "around": None}
     found = load_config(given, {"cost": foreign.cost, "disparity": search, **sgm})  # not the penalties of another cost
     if found.fits:
         found = load_config(found, {"refinement": {"method": "vfit"}, "products": {"sigma": False}})

@@ -176,7 +176,7 @@ def _at_levels(config: Config, high: float, low: float, quantile: float | None) 
     rows = [{"coverage": coverage, "high": high, "low": low, "quantile": quantile} for coverage in COVERAGES]
     constant = Calibration.model_validate({"name": "constant", "key": key_of(config), "levels": rows})
     interval = Interval(coverage=Decimal(str(COVERAGES[0])), calibration=constant)
-    disparity = config.disparity.model_copy(update={"local": False, "grid": None})
+    disparity = config.disparity.model_copy(update={"local": False, "grid": None, "around": None})
     return config.model_copy(update={"interval": interval, "disparity": disparity})
 
 
