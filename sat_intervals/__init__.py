@@ -16,6 +16,7 @@ if typing.TYPE_CHECKING:
     from sat_intervals.heights.geometry import set_geometry
     from sat_intervals.heights.triangulate import triangulate
     from sat_intervals.interop.dataset import decode_flags, open
+    from sat_intervals.match.calibrate_volumes import calibrate_volumes
     from sat_intervals.match.in_memory import intervals_around, match_arrays
     from sat_intervals.match.volumes import intervals_of
     from sat_intervals.raster import open_image
@@ -30,6 +31,7 @@ __all__ = [
     "SatIntervalsError",
     "Window",
     "__version__",
+    "calibrate_volumes",
     "decode_flags",
     "evaluate_run",
     "intervals_around",
@@ -51,6 +53,7 @@ _HOMES = {
     "RunError": "errors",
     "SatIntervalsError": "errors",
     "Window": "tiling",
+    "calibrate_volumes": "match.calibrate_volumes",
     "decode_flags": "interop.dataset",
     "evaluate_run": "evaluate.disparity",
     "intervals_around": "match.in_memory",

@@ -18,6 +18,9 @@ IMPOSSIBLE_COST = 65535
 # Sub-pixel bounds are multiples of 1 / 64 px, in files and, above the first disparity, in tiles.
 BOUND_STEPS = 64
 
+# The costs of probabilities are -ln(p / largest p of the pixel), at most this, divided by it.
+LOG_SPAN = 32
+
 # MC-CNN's matching cost is 1 - cosine in steps of 1 / 125 = 0.008. Its codes, 0 to 250, fit in a byte.
 COSINE_STEPS = 125
 

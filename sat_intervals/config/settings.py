@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from decimal import Decimal
 from fractions import Fraction
-from math import ceil, floor
+from math import ceil, floor, log1p
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -32,7 +32,7 @@ from sat_intervals.config.sections import (
     Volume,
 )
 from sat_intervals.config.weights import weights_file
-from sat_intervals.products import BOUND_STEPS, IMPOSSIBLE_COST
+from sat_intervals.products import BOUND_STEPS, IMPOSSIBLE_COST, LOG_SPAN
 
 SGM_PATHS = 8
 _CUT = 0.2  # of the span
@@ -208,6 +208,17 @@ class Config(Section):
         return self.largest_sum if self.sgm is None or self.sgm.span is None else self.in_steps(self.sgm.span)
 
     @property
+    def _is_logarithmic(self) -> bool:
+        """Return whether costs are logarithms of probabilities."""
+        return isinstance(self.cost, Volume) and self.cost.kind == "probability"
+
+    def _excess(self, share: Fraction) -> Fraction:
+        """Return the excess of the cost at which the possibility has fallen from 1 by a share."""
+        if self._is_logarithmic:
+            return Fraction(-log1p(-float(share)) / LOG_SPAN) * self.cost_span
+        return share * self.cost_span
+
+    @property
     def cut_level(self) -> int | None:
         """Return the largest whole ``S(d) - min S`` of the alpha-cut, ``floor((1 - alpha) * cost_span)``.
 
@@ -215,7 +226,7 @@ class Config(Section):
         """
         if self.interval is None or self.interval.alpha is None:
             return None
-        return floor((1 - Fraction(self.interval.alpha)) * self.cost_span)
+        return floor(self._excess(1 - Fraction(self.interval.alpha)))
 
     @property
     def cuts(self) -> Levels | None:
@@ -265,6 +276,8 @@ class Config(Section):
             return None
         step = Fraction(self.ambiguity.eta_step)
         count = ceil(Fraction(self.ambiguity.eta_max) / step)
+        if self._is_logarithmic:
+            return tuple(floor(self._excess(i * step)) for i in range(count))
         levels = step * self.cost_span  # integers from here on: fractions would take longer than matching a small tile
         return tuple(i * levels.numerator // levels.denominator for i in range(count))
 

@@ -10,6 +10,7 @@ import xarray as xr
 from sat_intervals.config import Config, ConfigError, Volume
 from sat_intervals.kernels.cost import Costs, padded_to_lanes
 from sat_intervals.match.matching_cost import MatchingCost
+from sat_intervals.products import LOG_SPAN
 from sat_intervals.tiling import strips
 
 # Names of dimensions, lower case.
@@ -156,7 +157,8 @@ def integer_costs(
     """Return the integer costs of values: ``(rows, columns, size)`` uint16, ``impossible_cost`` where not finite.
 
     blocked: ``(rows, columns)`` bool: pixels whose candidates are all impossible.
-    compares_pixels: whether probabilities are costs that pixels share, not shares of the largest of their pixel.
+    Costs of probabilities are logarithms of their share of the pixel's largest, see LOG_SPAN.
+    compares_pixels: whether they are those of the probabilities themselves, which pixels share.
     Raises with the number of values outside the span, or of pixels whose probabilities do not sum to 1.
     """
     cost, (height, width, count) = config.cost, values.shape
@@ -176,7 +178,10 @@ def integer_costs(
         if cost.kind == "probability" and not compares_pixels:
             _check_sums(part, impossible)
             part /= np.maximum(part.max(axis=2, keepdims=True), np.finfo(np.float32).tiny)
-        part = part - ends[0] if cost.kind == "cost" else ends[1] - part
+        if cost.kind == "probability":
+            part = -np.log(np.maximum(part, np.exp(-np.float32(LOG_SPAN)))) / LOG_SPAN
+        else:
+            part = part - ends[0] if cost.kind == "cost" else ends[1] - part
         part *= steps
         np.rint(part, out=part)
         np.clip(part, 0, config.largest_cost, out=part)

@@ -11,6 +11,7 @@ from sat_intervals.kernels.curves import read_right_winners
 from sat_intervals.kernels.disparity import cross_check
 from sat_intervals.match.foreign import Foreign, foreign_costs, integer_costs, open_foreign
 from sat_intervals.match.labelled import labelled
+from sat_intervals.match.matching_cost import MatchingCost
 from sat_intervals.match.memory import check_memory, volume_bytes
 from sat_intervals.match.patch import Frame, match_costed
 from sat_intervals.match.postprocess import RawRows
@@ -77,7 +78,7 @@ def intervals_of(
     foreign = open_foreign(volume, disparities, kind, span)
     settings = resolved(volume_config(foreign, config))
     flags = flags_of(valid, foreign.shape)
-    rows, settings = matched_volume(foreign, flags, right, settings)
+    rows, settings = matched_volume(foreign, cost_of(foreign, flags, settings), flags, right, settings)
     return labelled(_in_pixels(finish_whole(rows, settings), foreign, settings), foreign.labels, {})
 
 
@@ -98,21 +99,23 @@ def volume_config(foreign: Foreign, config: Config | Mapping[str, Any] | None) -
     return found
 
 
-def matched_volume(foreign: Foreign, flags: np.ndarray, right: Values | None, config: Config) -> tuple[RawRows, Config]:
-    """Return the raw products of a volume, cross-checked already if the settings that come back have none.
-
-    ``flags``: those of pixels that are not matched, see `flags_of`.
-    """
+def cost_of(foreign: Foreign, flags: np.ndarray, config: Config) -> MatchingCost:
+    """Return the costs of a volume; ``flags`` are those of pixels that are not matched, see `flags_of`."""
     rows, columns, count = foreign.shape
     check_memory(volume_bytes(rows, columns, config), f"{rows} x {columns} x {count} values", "give parts of it")
-    here = Window(0, 0, rows, columns)
+    return foreign_costs(integer_costs(foreign.values, config, flags != 0), count, config)
+
+
+def matched_volume(
+    foreign: Foreign, cost: MatchingCost, flags: np.ndarray, right: Values | None, config: Config
+) -> tuple[RawRows, Config]:
+    """Return the raw products of a volume, cross-checked already if the settings that come back have none."""
+    rows, columns, _ = foreign.shape
     checks = config.cross_check
     is_plain = right is None and foreign.step == 1 and foreign.kind != "probability"
     if checks and not is_plain:
         config = config.model_copy(update={"cross_check": None})
-    cost = foreign_costs(integer_costs(foreign.values, config, flags != 0), count, config)
-    patch = match_costed(None, Frame.of_whole(here), [cost], config)
-    del cost
+    patch = match_costed(None, Frame.of_whole(Window(0, 0, rows, columns)), [cost], config)
     raw = patch.raw
     if not (raw.winner != NO_DISPARITY).any():
         raise ConfigError("the volume has no finite value at any valid pixel")
@@ -148,7 +151,7 @@ def _of_right(foreign: Foreign, right: Values, config: Config) -> tuple[int, np.
     if there.shape[0] != foreign.shape[0]:
         raise ConfigError(f"the right volume has {there.shape[0]} rows, the left one {foreign.shape[0]}")
     settings = volume_config(there, config)
-    cost = foreign_costs(integer_costs(there.values, settings), there.shape[2], settings)
+    cost = cost_of(there, np.zeros(there.shape[:2], np.uint16), settings)
     raw = match_costed(None, Frame.of_whole(Window(0, 0, *there.shape[:2])), [cost], settings).raw
     back = np.floor(0.5 - (there.first + there.step * (raw.winner.astype(np.float64) - settings.disparity.minimum)))
     back[raw.winner == NO_DISPARITY] = NO_DISPARITY

@@ -5,15 +5,12 @@ import pytest
 import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
+from volumes import softmax, volume_of
 
-from sat_intervals import SatIntervalsError, Window, intervals_of, load_config, match_arrays
+from sat_intervals import SatIntervalsError, intervals_of, load_config, match_arrays
 from sat_intervals.demo import make_scene
 from sat_intervals.kernels.curves import read_alpha_cuts, read_right_winners, read_winners
 from sat_intervals.kernels.disparity import cross_check
-from sat_intervals.kernels.matching import cost_volume
-from sat_intervals.match.matching_cost import cost_areas
-from sat_intervals.match.patch import Frame, kernel_settings, patch_areas, patch_windows
-from sat_intervals.match.whole import cut, whole_view
 from sat_intervals.products import IMPOSSIBLE_COST, INVALID, MISMATCH, NO_CANDIDATE, OCCLUSION
 
 FIRST, LAST = -8, 20
@@ -29,16 +26,6 @@ def pair():
     return tuple(np.ma.masked_equal(image.astype(np.float32), 0) for image in (scene.left, scene.right))
 
 
-def volume_of(left, right, *, sgm=False):
-    """Our costs, aggregated or not: float32, NaN where impossible."""
-    frame = Frame.of_whole(Window(0, 0, *left.shape))
-    windows = patch_windows(frame, PAPER)
-    views = cut(whole_view(left), windows[0]), cut(whole_view(right), windows[1])
-    (costs,) = cost_areas(views, patch_areas(frame, PAPER), PAPER)
-    found = cost_volume(costs.costs, kernel_settings(PAPER)._replace(regularized=sgm))
-    return np.where(found == IMPOSSIBLE_COST, np.float32(np.nan), found.astype(np.float32))
-
-
 @pytest.fixture(scope="module")
 def ours(pair):
     return match_arrays(*pair, PAPER)
@@ -46,7 +33,7 @@ def ours(pair):
 
 @pytest.fixture(scope="module")
 def volume(pair):
-    return volume_of(*pair, sgm=True)
+    return volume_of(*pair, PAPER, sgm=True)
 
 
 def same(one, other):
@@ -65,7 +52,7 @@ def test_intervals_of__equals_match_arrays_on_our_volume(ours, volume):
 
 
 def test_intervals_of__runs_our_sgm_on_matching_costs(ours, pair):
-    costs, span, sgm = volume_of(*pair), 24, {"p1": PAPER.sgm.p1, "p2": PAPER.sgm.p2}
+    costs, span, sgm = volume_of(*pair, PAPER), 24, {"p1": PAPER.sgm.p1, "p2": PAPER.sgm.p2}
     found = intervals_of(costs, DISPARITIES, kind="cost", span=span, valid=ours["validity"], config={"sgm": sgm})
     same(found, ours)
     default = intervals_of(costs, DISPARITIES, kind="cost", span=span, config={"sgm": True})
@@ -173,12 +160,6 @@ def test_intervals_of__cross_checks_against_a_right_volume(volume):
     same(intervals_of(volume, DISPARITIES, kind="cost", span=448, right=right_volume(volume)), alone)
     wrong = intervals_of(volume, DISPARITIES, kind="cost", span=448, right=right_volume(volume)[::-1])
     assert np.isfinite(wrong["disparity"]).mean() < 0.7 * np.isfinite(alone["disparity"]).mean()
-
-
-def softmax(volume, temperature):
-    weights = np.exp(-np.nan_to_num(volume, nan=np.inf) / temperature)
-    with np.errstate(invalid="ignore"):
-        return (weights / weights.sum(axis=2, keepdims=True)).astype(np.float32)
 
 
 def test_intervals_of__cuts_probabilities_by_the_largest_of_a_pixel(volume):

@@ -1,0 +1,27 @@
+"""Volumes of our own costs, as another matcher would give them."""
+
+import numpy as np
+
+from sat_intervals import Config, Window
+from sat_intervals.kernels.matching import cost_volume
+from sat_intervals.match.matching_cost import cost_areas
+from sat_intervals.match.patch import Frame, kernel_settings, patch_areas, patch_windows
+from sat_intervals.match.whole import cut, whole_view
+from sat_intervals.products import IMPOSSIBLE_COST
+
+
+def volume_of(left: np.ndarray, right: np.ndarray, config: Config, *, sgm: bool = False) -> np.ndarray:
+    """Our costs, aggregated or not: float32, NaN where impossible."""
+    frame = Frame.of_whole(Window(0, 0, *left.shape))
+    windows = patch_windows(frame, config)
+    views = cut(whole_view(left), windows[0]), cut(whole_view(right), windows[1])
+    (costs,) = cost_areas(views, patch_areas(frame, config), config)
+    found = cost_volume(costs.costs, kernel_settings(config)._replace(regularized=sgm))
+    return np.where(found == IMPOSSIBLE_COST, np.float32(np.nan), found.astype(np.float32))
+
+
+def softmax(volume: np.ndarray, temperature: float) -> np.ndarray:
+    """Probabilities of costs."""
+    weights = np.exp(-np.nan_to_num(volume, nan=np.inf) / temperature)
+    with np.errstate(invalid="ignore"):
+        return (weights / weights.sum(axis=2, keepdims=True)).astype(np.float32)
