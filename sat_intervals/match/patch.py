@@ -10,8 +10,9 @@ from sat_intervals.kernels.cost import Cells
 from sat_intervals.kernels.matching import Raw, RightView, match_costs
 from sat_intervals.kernels.sgm import Borders, Edge
 from sat_intervals.kernels.sweeps import Settings
+from sat_intervals.match.costs import MatchingCost
 from sat_intervals.match.local_ranges import LocalRanges, narrowed
-from sat_intervals.match.matching_cost import Area, MatchingCost, cost_areas, textureless, view_windows
+from sat_intervals.match.matching_cost import Area, cost_areas, textureless, view_windows
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.products import IMPOSSIBLE_COST, LEFT_MASKED, MASKED, MISMATCH, NO_DISPARITY, RANGE_END
 from sat_intervals.tiling import Views, Window, facing

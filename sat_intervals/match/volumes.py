@@ -9,9 +9,9 @@ import xarray as xr
 from sat_intervals.config import Config, ConfigError, load_config, resolved
 from sat_intervals.kernels.curves import read_right_winners
 from sat_intervals.kernels.disparity import cross_check
-from sat_intervals.match.foreign import Foreign, foreign_costs, integer_costs, open_foreign
+from sat_intervals.match.costs import MatchingCost, foreign_costs, integer_costs
+from sat_intervals.match.foreign import Foreign, open_foreign
 from sat_intervals.match.labelled import labelled
-from sat_intervals.match.matching_cost import MatchingCost
 from sat_intervals.match.memory import check_memory, volume_bytes
 from sat_intervals.match.patch import Frame, match_costed
 from sat_intervals.match.postprocess import RawRows
