@@ -36,6 +36,7 @@ def integer_costs(
     assert isinstance(cost, Volume)
     ends, steps = (float(cost.lowest), float(cost.lowest + cost.span)), float(config.steps)
     made = np.zeros((height, width, padded_to_lanes(count)), np.uint16)
+    margin = _TOLERANCE * (ends[1] - ends[0])
     outside, number = 0, np.result_type(values.dtype, np.float32)
     for window in strips(height, width, _PIXELS):
         rows = slice(window.row, window.row_stop)
@@ -43,9 +44,9 @@ def integer_costs(
         impossible = ~np.isfinite(part)
         if blocked is not None:
             impossible |= blocked[rows, :, np.newaxis]
-        part[impossible] = ends[0]
-        margin = _TOLERANCE * (ends[1] - ends[0])
-        outside += int(((part < ends[0] - margin) | (part > ends[1] + margin)).sum())
+        np.copyto(part, ends[0], where=impossible)
+        if part.min() < ends[0] - margin or part.max() > ends[1] + margin:
+            outside += int(((part < ends[0] - margin) | (part > ends[1] + margin)).sum())
         if cost.kind == "probability" and not compares_pixels:
             _check_sums(part, impossible)
             part /= np.maximum(part.max(axis=2, keepdims=True), np.finfo(np.float32).tiny)
@@ -56,7 +57,7 @@ def integer_costs(
         part *= steps
         np.rint(part, out=part)
         np.clip(part, 0, config.largest_cost, out=part)
-        part[impossible] = config.impossible_cost
+        np.copyto(part, config.impossible_cost, where=impossible)
         made[rows, :, :count] = part
     if outside:
         raise ConfigError(f"{outside} of {values.size} values are outside {ends[0]:g} to {ends[1]:g}: give their span")
