@@ -259,11 +259,9 @@ def candidate_costs(candidates, r, c, k):
 
 
 @inlined
-def possible_count(possible, costs, usable, span, r, c):
-    """Return the number of possible candidates of a pixel; ``possible`` is that of ``costs``."""
-    if possible is None:
-        return usable[c + span.last + 1] - usable[c + span.first] if costs.left_state[r, c] == 0 else 0
-    return possible[r, c]
+def possible_count(possible, r, c, of_states):
+    """Return the number of possible candidates of a pixel, by the states or as the costs mark them."""
+    return of_states if possible is None else possible[r, c]
 
 
 @inlined

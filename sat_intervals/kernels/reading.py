@@ -82,12 +82,12 @@ def open_curve(curve, opened, span):
 @inlined
 def close_impossible(curve, candidates, span, r, c, impossible):
     """Set impossible candidates and those that are not searched to IMPOSSIBLE_COST; return the lowest cost."""
-    own, left = candidates.costs.possible, candidates.costs.left
     lowest = splat(np.uint16(IMPOSSIBLE_COST))
     for k in range(span.start, span.stop, LANES):
         wall = load(candidates.beyond, candidates.walls[c] + k)
         closed = fill_where_nonzero(larger(load(candidates.barrier, c + k), wall))
-        closed = larger(closed, closed_by_costs(own, left, r, c, k, impossible))
+        own = closed_by_costs(candidates.costs.possible, candidates.costs.left, r, c, k, impossible)
+        closed = larger(closed, own)
         costs = larger(load(curve, k), closed)
         store(curve, k, costs)
         lowest = smaller(lowest, costs)

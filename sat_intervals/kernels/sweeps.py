@@ -176,7 +176,8 @@ def _enter_row(buffers, gradients, settings, r):
     enter_cells(candidates, cells, ranges, r)
     for c in range(possible.size):
         span = span_at(ranges, settings.count, curve.size, c)
-        possible[c] = possible_count(costs.possible, costs, usable, span, r, c)
+        inner = usable[c + span.last + 1] - usable[c + span.first]
+        possible[c] = possible_count(costs.possible, r, c, inner if costs.left_state[r, c] == 0 else 0)
     falling, rising = -r % possible.size, r % possible.size
     enter_row(paths, possible.size, falling, rising, down)
     take_over(paths, around, inside, r, falling, rising, down)

@@ -95,6 +95,8 @@ def load_network(file: Path) -> Network:
 
 def network_of(cost: Census | Mccnn | Volume, inputs: Mapping[str, Any]) -> Network | None:
     """Return the network of a run with these inputs, on any worker; None if its cost needs none."""
+    if isinstance(cost, Volume):
+        raise SatIntervalsError(f"the costs of this run are those of {cost.name}, which only match_pair calls")
     if not isinstance(cost, Mccnn):
         return None
     weights = _Weights.of(weights_file(cost.weights))
