@@ -10,7 +10,7 @@ from typing import IO
 import click
 
 from sat_intervals.cli.signals import Ended
-from sat_intervals.progress import REPORT
+from sat_intervals.errors import REPORT
 
 _LOG = logging.getLogger(__name__)
 _LINES = logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s")

@@ -260,12 +260,19 @@ def _named(settings: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _with_search(
-    *, settings: SettingsArguments, disparity: tuple[int, int] | None, local_range: bool
+    *,
+    settings: SettingsArguments,
+    disparity: tuple[int, int] | None,
+    local_range: bool,
+    around: str | None,
+    margin: int | None,
 ) -> SettingsArguments:
     if disparity:
         ends = {"disparity.minimum": disparity[0], "disparity.maximum": disparity[1]}
         _put(settings.sections, "--disparity", **ends)
     _put(settings.sections, "--local-range", **{"disparity.local": local_range or None})
+    _put(settings.sections, "--around", **{"disparity.around": around})
+    _put(settings.sections, "--margin", **{"disparity.margin": margin})
     return settings
 
 
@@ -285,6 +292,10 @@ def search_options(command: Command) -> Command:
             is_flag=True,
             help="Search a separate range in each cell of the image, found from the images.",
         ),
+        click.option(
+            "--around", type=NAME, help="Disparities of another matcher, a raster: search around them and audit them."
+        ),
+        click.option("--margin", type=int, metavar="K", help="Pixels to search on both sides of --around; default 8."),
     )
 
 

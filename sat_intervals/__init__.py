@@ -16,7 +16,9 @@ if typing.TYPE_CHECKING:
     from sat_intervals.heights.geometry import set_geometry
     from sat_intervals.heights.triangulate import triangulate
     from sat_intervals.interop.dataset import decode_flags, open
-    from sat_intervals.match.in_memory import match_arrays
+    from sat_intervals.match.calibrate_volumes import calibrate_volumes
+    from sat_intervals.match.in_memory import intervals_around, match_arrays
+    from sat_intervals.match.volumes import intervals_of
     from sat_intervals.raster import open_image
     from sat_intervals.run.pair import match_pair
     from sat_intervals.tiling import Window
@@ -29,8 +31,11 @@ __all__ = [
     "SatIntervalsError",
     "Window",
     "__version__",
+    "calibrate_volumes",
     "decode_flags",
     "evaluate_run",
+    "intervals_around",
+    "intervals_of",
     "load_config",
     "make_surface",
     "match_arrays",
@@ -48,8 +53,11 @@ _HOMES = {
     "RunError": "errors",
     "SatIntervalsError": "errors",
     "Window": "tiling",
+    "calibrate_volumes": "match.calibrate_volumes",
     "decode_flags": "interop.dataset",
     "evaluate_run": "evaluate.disparity",
+    "intervals_around": "match.in_memory",
+    "intervals_of": "match.volumes",
     "load_config": "config",
     "make_surface": "heights.dsm",
     "match_arrays": "match.in_memory",

@@ -1,5 +1,6 @@
 """Define the data dictionary: bands, validity flags and the states of an input pixel."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,6 +17,9 @@ IMPOSSIBLE_COST = 65535
 
 # Sub-pixel bounds are multiples of 1 / 64 px, in files and, above the first disparity, in tiles.
 BOUND_STEPS = 64
+
+# The costs of probabilities are -ln(p / largest p of the pixel), at most this, divided by it.
+LOG_SPAN = 32
 
 # MC-CNN's matching cost is 1 - cosine in steps of 1 / 125 = 0.008. Its codes, 0 to 250, fit in a byte.
 COSINE_STEPS = 125
@@ -93,12 +97,15 @@ BANDS = (
     Band("confidence", "", "confidence from ambiguity, 0 to 1, high = unambiguous"),
 )
 
-_SIGMA = Band("sigma", "px", "standard deviation of the least-squares fit of the disparity, no data without one")
+_EXTRA = (
+    Band("sigma", "px", "standard deviation of the least-squares fit of the disparity, no data without one"),
+    Band("agreement", "", "1 where the disparity that was given is in the interval, 0 where not; no data without both"),
+)
 
 
-def interval_bands(*, sigma: bool) -> tuple[Band, ...]:
-    """Return the bands of a run, with a fifth one of deviations if they are asked for."""
-    return (*BANDS, _SIGMA) if sigma else BANDS
+def interval_bands(extra: Collection[str] = ()) -> tuple[Band, ...]:
+    """Return the bands of a run, with those of ``sigma`` and ``agreement`` that are asked for."""
+    return *BANDS, *(band for band in _EXTRA if band.name in extra)
 
 
 class Bands(NamedTuple):
@@ -112,6 +119,7 @@ class Bands(NamedTuple):
     truth: np.ndarray = np.empty((0, 0))  # true disparity in pixels, floats, NaN where unknown; empty if not read
     image: np.ndarray = np.empty((0, 0))  # grey values of the left image, floats, NaN where no data; empty if not read
     sigma: np.ndarray = np.empty((0, 0))  # float32 pixels, NaN without a fit; empty if not asked for
+    agreement: np.ndarray = np.empty((0, 0))  # float32, 1, 0 or NaN; empty if not asked for
 
     @property
     def valid(self) -> np.ndarray:

@@ -8,9 +8,6 @@ from contextlib import contextmanager
 Progress = Callable[[str, int, int], None]
 """Callback with the name of a stage, the amount done, and the total amount."""
 
-REPORT = "sat_intervals.report"
-"""Name of the logger of the warnings of a run, which commands print below their table."""
-
 _LOG = logging.getLogger(__name__)
 
 

@@ -94,7 +94,7 @@ class Run:
     def check_kept(self, outputs: Iterable[str | Path], inputs: Iterable[str | Path | None] = ()) -> None:
         """Raise if an output would replace a file of the run, one of its inputs, the truth, or one of ``inputs``."""
         own = [self.out / name for name in (*_BANDS, "run.json")]
-        grid = self.config.disparity.grid
+        grid = self.config.disparity.grid  # other rasters are inputs
         check_not_replaced([*own, *_paths(self.report["inputs"]), grid, self.truth_beside, *inputs], outputs)
 
     def layer(self, path: str | Path) -> Layer:
@@ -128,7 +128,7 @@ class Results(Run):
     def read_pixel(self, row: int, column: int) -> Bands:
         """Read bands, left image and truth of one pixel as zero-dimensional arrays."""
         self.check_pixel(row, column)
-        return Bands(*(band[0, 0] for band in self.read(Window(row, column, 1, 1))[:-1]))  # not sigma
+        return Bands(*(band[0, 0] for band in self.read(Window(row, column, 1, 1))[:-2]))  # no extra bands
 
     def strips(self) -> Iterator[tuple[int, Bands]]:
         """Yield the first row and the content (see `read`) of each strip, from the top."""
@@ -180,7 +180,7 @@ def open_run(out: str | Path) -> Run:
     except ValueError as error:
         where = ", see " + ".".join(map(str, error.errors()[0]["loc"])) if isinstance(error, ValidationError) else ""
         raise SatIntervalsError(f"{file} is not the report of a run{where}: match again with --overwrite") from error
-    counts = {**_BANDS, "intervals.tif": len(interval_bands(sigma=config.products.sigma))}
+    counts = {**_BANDS, "intervals.tif": len(interval_bands(config.extra_bands))}
     places = [_place(file.with_name(name), (n, region.height, region.width)) for name, n in counts.items()]
     return Run(file.parent, report, config, region, places[-1])
 

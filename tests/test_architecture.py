@@ -47,6 +47,7 @@ HOMES = {
 MOST_FUNCTION_LINES, MOST_MODULE_LINES, MOST_PARAMETERS = 45, 300, 8
 OVER_THE_LIMITS = {
     "sat_intervals.interop.cars_method.run": "its parameters are those of CARS' method",
+    "sat_intervals.run.pair.match_pair": "what a run takes, with a matcher of one's own",
 }
 
 # Test files without a module of their name: they test several modules together.

@@ -135,6 +135,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / name).unlink()
     copies = {
         "left": ["left.vrt", "stereo/run-L.tif", "TILE/pair_1/rectified_ref.tif"],
+        "truth": ["disparity.tif"],
         "right": ["right.vrt", "stereo/run-R.tif", "TILE/pair_1/rectified_sec.tif"],
     }
     for pair in ("pair1", "pair2", "pair3", "PAIRS..."):
@@ -183,6 +184,7 @@ def test_commands__of_all_documents_run(place: Path) -> None:
 
 
 @pytest.mark.process
+@pytest.mark.peer("pandora")
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 def test_code__of_all_documents_runs(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(place)

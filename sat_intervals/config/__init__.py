@@ -7,7 +7,16 @@ from sat_intervals.config.interval import Interval
 from sat_intervals.config.penalties import MccnnSgm, Sgm
 from sat_intervals.config.presets import PRESETS, preset_text
 from sat_intervals.config.reading import load_config, named_files, read_yaml
-from sat_intervals.config.sections import Ambiguity, Census, Cluster, ConfigError, Disparity, Mccnn, Regularization
+from sat_intervals.config.sections import (
+    Ambiguity,
+    Census,
+    Cluster,
+    ConfigError,
+    Disparity,
+    Mccnn,
+    Regularization,
+    Volume,
+)
 from sat_intervals.config.settings import Config, key_of
 from sat_intervals.config.wording import allowed
 
@@ -26,6 +35,7 @@ __all__ = [
     "MccnnSgm",
     "Regularization",
     "Sgm",
+    "Volume",
     "WidthClass",
     "allowed",
     "calibration_of",

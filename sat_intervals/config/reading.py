@@ -14,7 +14,7 @@ from sat_intervals.config.weights import NETWORKS
 from sat_intervals.config.wording import explained, shown
 
 # Settings that name a file.
-_FILES = ("cost", "weights"), ("interval", "calibration"), ("disparity", "grid")
+_FILES = ("cost", "weights"), ("interval", "calibration"), ("disparity", "grid"), ("disparity", "around")
 
 
 def load_config(

@@ -3,6 +3,8 @@
 import json
 from collections.abc import Mapping
 from decimal import Decimal
+from fractions import Fraction
+from math import floor
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
@@ -60,6 +62,8 @@ if TYPE_CHECKING:
     Pixels = int
 else:
     Pixels = Annotated[int, Field(ge=-MOST_PIXELS, le=MOST_PIXELS)] | Literal["auto"]
+# Integer costs of a foreign volume, at most: without SGM, and with it together with P2.
+_LEVELS, _SGM_LEVELS = 50_000, 8_190
 
 
 class StrictModel(BaseModel):
@@ -93,10 +97,15 @@ class Disparity(Section):
         None, description="raster of two bands, minimum and maximum, for local ranges; null: found from the images"
     )
 
+    around: AbsolutePath | None = Field(
+        None, description="raster of another matcher's disparities, band 1, to search around and to audit; or null"
+    )
+    margin: int = Field(8, ge=1, le=1000, description="pixels searched on both sides of what around has in a cell")
+
     @property
     def is_local(self) -> bool:
         """Return whether cells have ranges of their own."""
-        return self.local or self.grid is not None
+        return self.local or self.grid is not None or self.around is not None
 
     @property
     def is_auto(self) -> bool:
@@ -118,6 +127,8 @@ class Disparity(Section):
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
+        if self.around is not None and (self.local or self.grid is not None):
+            raise ValueError("around gives local ranges of its own: leave out local and grid")
         if isinstance(self.minimum, str) != isinstance(self.maximum, str):
             raise ValueError(f"minimum is {self.minimum}, maximum is {self.maximum}: give two numbers, or auto twice")
         if not self.is_auto and self.minimum > self.maximum:
@@ -132,7 +143,7 @@ class Census(Section):
     window: Odd = Field(7, ge=3, le=11, description="side of the square window, in pixels")
 
     steps: ClassVar = 1  # quantisation levels per unit of cost, a bit
-    precomputed: ClassVar = False  # SGM compares codes
+    precomputed: ClassVar = 0  # bytes of a cost: SGM compares codes
     needs_statistics: ClassVar = False
 
     @property
@@ -158,8 +169,45 @@ class Mccnn(Section):
     steps: ClassVar = COSINE_STEPS  # quantisation levels per unit of cost, a unit of the cosine
     largest: ClassVar = 2 * COSINE_STEPS  # integer cost
     ceiling: ClassVar = largest  # as of Census
-    precomputed: ClassVar = True  # the costs of a patch are computed before SGM, a byte each
+    precomputed: ClassVar = 1  # bytes of a cost: those of a patch are computed before SGM
     needs_statistics: ClassVar = True  # mean and standard deviation of the whole images
+
+
+class Volume(Section):
+    """Matching cost: values of another matcher, see `intervals_of` and ``volume_of`` of `match_pair`."""
+
+    method: Literal["volume"] = Field("volume", description="values of another matcher; from Python only")
+    kind: Literal["cost", "similarity", "probability"] = Field(
+        "cost", description="what the values are: the best is the smallest, or the largest; or they sum to 1"
+    )
+    span: Exact = Field(Decimal(1), gt=0, description="largest possible value minus the smallest; 1 for probabilities")
+    lowest: Exact = Field(Decimal(0), description="smallest possible value")
+    margin: int = Field(0, ge=0, le=1024, description="pixels that volume_of needs around a tile")
+    name: str | None = Field(None, description="of the function volume_of; set by match_pair")
+
+    precomputed: ClassVar = 2  # bytes of a cost
+    needs_statistics: ClassVar = False
+
+    @property
+    def window(self) -> int:
+        """Return the side of the window that a value depends on, in pixels."""
+        return 2 * self.margin + 1
+
+    def levels(self, p2: Fraction | None) -> int:
+        """Return the number of integer costs that the span becomes: a multiple of a whole span, if that fits.
+
+        ``p2``: the largest penalty of SGM, in units of the values; None without SGM. With it, 8 times the sum of the
+        largest cost and P2 fits in 16 bits.
+        """
+        span = Fraction(self.span)
+        most = _LEVELS if p2 is None else floor(_SGM_LEVELS * span / (span + p2))
+        return most // span.numerator * span.numerator if span.denominator == 1 and span <= most else max(most, 1)
+
+    @model_validator(mode="after")
+    def _check_probability(self) -> Self:
+        if self.kind == "probability" and (self.span != 1 or self.lowest != 0):
+            raise ValueError(f"span is {self.span}, lowest {self.lowest}, but probabilities are 0 to 1: leave both out")
+        return self
 
 
 class Ambiguity(Section):

@@ -2,9 +2,10 @@
 
 import hashlib
 from collections.abc import Mapping
+from contextlib import suppress
 from decimal import Decimal
 from fractions import Fraction
-from math import ceil, floor
+from math import ceil, floor, log1p
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -28,9 +29,10 @@ from sat_intervals.config.sections import (
     Regularization,
     Section,
     Tiles,
+    Volume,
 )
 from sat_intervals.config.weights import weights_file
-from sat_intervals.products import BOUND_STEPS, IMPOSSIBLE_COST
+from sat_intervals.products import BOUND_STEPS, IMPOSSIBLE_COST, LOG_SPAN
 
 SGM_PATHS = 8
 _CUT = 0.2  # of the span
@@ -44,7 +46,7 @@ class Config(Section):
     rows: Literal["auto", "none"] = Field(
         "auto", description="row offsets of the right image: measured and taken out, or left"
     )
-    cost: Census | Mccnn = Field(Census(), discriminator="method")
+    cost: Census | Mccnn | Volume = Field(Census(), discriminator="method")
     sgm: AnySgm | None = Sgm()
     ambiguity: Ambiguity | None = Ambiguity()
     interval: Interval | None = Interval()
@@ -65,6 +67,8 @@ class Config(Section):
         preset = values.get("preset", PRESETS[0])
         values = merged(preset_settings(preset) if preset in PRESETS else {}, values)
         cost, sgm = values.get("cost"), values.get("sgm", {})
+        if isinstance(cost, Mapping) and cost.get("method") == "volume":
+            values["sgm"] = sgm = _sgm_of_volume(cost, sgm)
         if isinstance(sgm, Mapping):
             is_mccnn = isinstance(cost, Mapping) and cost.get("method") == "mccnn"
             values["sgm"] = {"penalty": "mc_cnn_fast" if is_mccnn else "constant", **sgm}
@@ -91,6 +95,11 @@ class Config(Section):
             raise ValueError(
                 "disparity has local ranges, which cross_check.method accurate does not know: use fast, or one range"
             )
+        if isinstance(self.cost, Volume) and (self.disparity.is_local or self.matches_right_view):
+            raise ValueError(
+                "cost.method volume goes with one search range and cross_check.method fast: leave out local ranges and "
+                "accurate"
+            )
         # Neighbouring tiles are compared on a ring of one pixel around the core, which needs complete windows.
         smallest = self.cost.window // 2 + 1
         if self.tiles.overlap != "exact" and self.tiles.overlap < smallest:
@@ -101,6 +110,11 @@ class Config(Section):
 
     def _check_sgm(self, sgm: Sgm | MccnnSgm) -> None:
         is_census = isinstance(self.cost, Census)
+        if isinstance(self.cost, Volume):
+            if isinstance(sgm, MccnnSgm) or self.cost.kind == "probability":
+                what = f"penalty {sgm.penalty}" if isinstance(sgm, MccnnSgm) else "probabilities"
+                raise ValueError(f"sgm is given with {what}, allowed: constant penalties and costs or similarities")
+            return
         if is_census and isinstance(sgm, MccnnSgm):
             raise ValueError(f"sgm.penalty is {sgm.penalty}, allowed: constant with cost.method census")
         if is_census and sgm.span is not None:
@@ -127,9 +141,23 @@ class Config(Section):
     def _cost_in_words(self) -> str:
         return f"cost.window {self.cost.window}" if isinstance(self.cost, Census) else f"cost.method {self.cost.method}"
 
+    @property
+    def largest_cost(self) -> int:
+        """Return the largest integer cost before SGM; the smallest is 0."""
+        if isinstance(self.cost, Volume):
+            return self.cost.levels(Fraction(self.sgm.p2) if self.sgm else None)
+        return self.cost.largest
+
+    @property
+    def steps(self) -> Fraction:
+        """Return the number of integer costs of a unit of the settings."""
+        if isinstance(self.cost, Volume):
+            return self.largest_cost / Fraction(self.cost.span)
+        return Fraction(self.cost.steps)
+
     def in_steps(self, value: Decimal | float | Fraction) -> int:
         """Round a cost in units of the settings to the nearest integer cost."""
-        return floor(Fraction(value) * self.cost.steps + Fraction(1, 2))
+        return floor(Fraction(value) * self.steps + Fraction(1, 2))
 
     @property
     def matches_right_view(self) -> bool:
@@ -140,6 +168,12 @@ class Config(Section):
     def hands_states_on(self) -> bool:
         """Return whether tiles hand path states of SGM to their neighbours."""
         return self.tiles.overlap == "exact" and self.sgm is not None
+
+    @property
+    def extra_bands(self) -> tuple[str, ...]:
+        """Return the bands after those of every run, see `interval_bands`."""
+        asked = {"sigma": self.products.sigma, "agreement": self.disparity.around is not None}
+        return tuple(name for name, is_asked in asked.items() if is_asked)
 
     @property
     def opens_ends(self) -> bool:
@@ -154,12 +188,14 @@ class Config(Section):
     @property
     def impossible_cost(self) -> int:
         """Return the cost of an impossible candidate inside SGM, above every possible cost + P2."""
+        if isinstance(self.cost, Volume):  # with a whole span as with Census
+            return self.largest_cost + self.largest_p2 + 2 * max(1, min(int(self.steps), self.largest_cost // 8))
         return self.cost.ceiling + self.largest_p2 + self.cost.steps
 
     @property
     def largest_sum(self) -> int:
         """Return the largest possible cost, after SGM if it is on; the smallest is 0."""
-        return self.cost.largest if self.sgm is None else SGM_PATHS * (self.cost.largest + self.largest_p2)
+        return self.largest_cost if self.sgm is None else SGM_PATHS * (self.largest_cost + self.largest_p2)
 
     @property
     def cost_span(self) -> int:
@@ -172,6 +208,17 @@ class Config(Section):
         return self.largest_sum if self.sgm is None or self.sgm.span is None else self.in_steps(self.sgm.span)
 
     @property
+    def _is_logarithmic(self) -> bool:
+        """Return whether costs are logarithms of probabilities."""
+        return isinstance(self.cost, Volume) and self.cost.kind == "probability"
+
+    def _excess(self, share: Fraction) -> Fraction:
+        """Return the excess of the cost at which the possibility has fallen from 1 by a share."""
+        if self._is_logarithmic:
+            return Fraction(-log1p(-float(share)) / LOG_SPAN) * self.cost_span
+        return share * self.cost_span
+
+    @property
     def cut_level(self) -> int | None:
         """Return the largest whole ``S(d) - min S`` of the alpha-cut, ``floor((1 - alpha) * cost_span)``.
 
@@ -179,7 +226,7 @@ class Config(Section):
         """
         if self.interval is None or self.interval.alpha is None:
             return None
-        return floor((1 - Fraction(self.interval.alpha)) * self.cost_span)
+        return floor(self._excess(1 - Fraction(self.interval.alpha)))
 
     @property
     def cuts(self) -> Levels | None:
@@ -229,6 +276,8 @@ class Config(Section):
             return None
         step = Fraction(self.ambiguity.eta_step)
         count = ceil(Fraction(self.ambiguity.eta_max) / step)
+        if self._is_logarithmic:
+            return tuple(floor(self._excess(i * step)) for i in range(count))
         levels = step * self.cost_span  # integers from here on: fractions would take longer than matching a small tile
         return tuple(i * levels.numerator // levels.denominator for i in range(count))
 
@@ -251,6 +300,15 @@ class Config(Section):
         return (len(levels) - below).astype(np.uint16)
 
 
+def _sgm_of_volume(cost: Mapping[str, Any], sgm: Any) -> Any:
+    """Return the section ``sgm`` of a foreign volume: none by default; true: the preset's penalties by its span."""
+    if sgm is True:
+        with suppress(ArithmeticError, ValueError):  # the section names a span that is no number
+            span = Decimal(str(cost.get("span", 1)))
+            return {"p1": float(span / 2), "p2": float(3 * span)}
+    return sgm or None
+
+
 def key_of(config: Config) -> dict[str, Any]:
     """Return all settings that decide which coverage a level reaches, as a calibration holds them.
 
@@ -258,6 +316,8 @@ def key_of(config: Config) -> dict[str, Any]:
     """
     sections = config.model_dump(mode="json")
     cost, sgm, ambiguity, low = (sections[name] for name in ("cost", "sgm", "ambiguity", "regularization"))
+    if isinstance(config.cost, Volume):
+        cost = {name: cost[name] for name in ("method", "kind", "span", "lowest")}
     if "weights" in cost:
         with weights_file(cost["weights"]).open("rb") as weights:
             cost["weights"] = hashlib.file_digest(weights, "sha256").hexdigest()

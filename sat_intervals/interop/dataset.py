@@ -68,8 +68,7 @@ def open(out: str | Path, chunks: int | None = 2048) -> xr.Dataset:
     dataset.attrs = {"title": "disparity with intervals", "source": "sat-intervals", "finished": run.report["finished"]}
     if run.config.preset:
         dataset.attrs["preset"] = run.config.preset
-    products = run.config.products
-    for file in run_files(products.compression, sigma=products.sigma):
+    for file in run_files(run.config.products.compression, run.config.extra_bands):
         for number, band in enumerate(file.bands, start=1):
             lazy = indexing.LazilyIndexedArray(_Layer(run, file.name, number, file.dtype))
             attributes = {"long_name": band.meaning} | ({"units": band.unit} if band.unit else {})

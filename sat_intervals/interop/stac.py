@@ -136,9 +136,7 @@ def _assets(run: Run) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the key and the content of each asset; surface and maps of other runs are left out."""
     yield (
         "intervals",
-        _raster(
-            run, "intervals.tif", "Disparity, its interval, confidence", interval_bands(sigma=run.config.products.sigma)
-        ),
+        _raster(run, "intervals.tif", "Disparity, its interval, confidence", interval_bands(run.config.extra_bands)),
     )
     yield "validity", _raster(run, "validity.tif", "Validity flags", (_VALIDITY,))
     if run.has_current("dsm.tif"):

@@ -8,7 +8,18 @@ from typing import NamedTuple
 import numpy as np
 
 from sat_intervals.kernels.compiled import cached, inlined, part
-from sat_intervals.kernels.vector import LANES, add, hamming, larger, load, load_bytes, store
+from sat_intervals.kernels.vector import (
+    LANES,
+    add,
+    fill_where_nonzero,
+    hamming,
+    larger,
+    load,
+    load_costs,
+    splat,
+    store,
+    subtract,
+)
 from sat_intervals.tiling import Window
 
 
@@ -27,17 +38,20 @@ class Costs(NamedTuple):
     """Matching costs of a patch: Census codes to compare, or precomputed costs.
 
     left, right: words of Census codes, ``(words, rows, columns)`` and ``(words, rows, width)``, padded after the last
-        column by whole vectors; or ``left`` holds the costs, ``(rows, columns, size)`` uint8, and ``right`` is None.
-        ``size`` is the count padded to a multiple of 32 lanes, `padded_to_lanes`; lanes beyond the count may hold
-        anything. Kernels are compiled for either form.
+        column by whole vectors; or ``left`` holds the costs, ``(rows, columns, size)`` uint8 or uint16, and ``right``
+        is None. ``size`` is the count padded to a multiple of 32 lanes, `padded_to_lanes`; lanes beyond the count may
+        hold anything. Kernels are compiled for each form.
     left_state: ``(rows, columns)`` uint8, 0 = usable window.
     right_state: ``(rows, columns + count - 1)`` uint8: ``right_state[r, c + k]`` faces left ``(r, c)`` at index k.
+    possible: ``(rows, columns)`` int64: number of possible candidates of each pixel, where the costs themselves mark
+        the impossible ones, by ``Settings.impossible``; None where the states do.
     """
 
     left: np.ndarray
     right: np.ndarray | None
     left_state: np.ndarray
     right_state: np.ndarray
+    possible: np.ndarray | None = None
 
 
 def between(left: Codes, right: Codes) -> Costs:
@@ -139,7 +153,7 @@ def census(pixels: np.ndarray, state: np.ndarray, window: int) -> Codes:
 def _matching_costs(left, right, r, c, k):
     """Costs of the candidates ``k .. k + 31`` of the left pixel ``(r, c)``; arrays as in `Costs`."""
     if right is None:
-        return load_bytes(left, (r * left.shape[1] + c) * left.shape[2] + k)
+        return load_costs(left, (r * left.shape[1] + c) * left.shape[2] + k)
     rows, width = right.shape[1:]
     costs = hamming(right, r * width + c + k, left[0, r, c])
     for w in range(1, left.shape[0]):
@@ -242,6 +256,22 @@ def candidate_costs(candidates, r, c, k):
     """Costs of the candidates ``k .. k + 31`` of a pixel, raised where they are impossible or not searched."""
     costs = _matching_costs(candidates.costs.left, candidates.costs.right, r, c, k)
     return larger(larger(costs, load(candidates.barrier, c + k)), load(candidates.beyond, candidates.walls[c] + k))
+
+
+@inlined
+def possible_count(possible, r, c, of_states):
+    """Return the number of possible candidates of a pixel, by the states or as the costs mark them."""
+    return of_states if possible is None else possible[r, c]
+
+
+@inlined
+def closed_by_costs(possible, left, r, c, k, impossible):
+    """65535 where the costs of a volume mark the candidates ``k .. k + 31`` as impossible; zeros without marks."""
+    if possible is None:
+        return splat(np.uint16(0))
+    below = splat(np.uint16(impossible - 1))
+    costs = load_costs(left, (r * left.shape[1] + c) * left.shape[2] + k)
+    return fill_where_nonzero(subtract(larger(costs, below), below))
 
 
 @inlined

@@ -9,6 +9,7 @@ import numpy as np
 
 from sat_intervals.kernels.compiled import inlined, part
 from sat_intervals.kernels.confidence import ambiguity
+from sat_intervals.kernels.cost import closed_by_costs
 from sat_intervals.kernels.disparity import vfit
 from sat_intervals.kernels.intervals import alpha_cut, subpixel_cuts
 from sat_intervals.kernels.vector import (
@@ -79,12 +80,14 @@ def open_curve(curve, opened, span):
 
 
 @inlined
-def close_impossible(curve, candidates, span, c):
+def close_impossible(curve, candidates, span, r, c, impossible):
     """Set impossible candidates and those that are not searched to IMPOSSIBLE_COST; return the lowest cost."""
     lowest = splat(np.uint16(IMPOSSIBLE_COST))
     for k in range(span.start, span.stop, LANES):
         wall = load(candidates.beyond, candidates.walls[c] + k)
         closed = fill_where_nonzero(larger(load(candidates.barrier, c + k), wall))
+        own = closed_by_costs(candidates.costs.possible, candidates.costs.left, r, c, k, impossible)
+        closed = larger(closed, own)
         costs = larger(load(curve, k), closed)
         store(curve, k, costs)
         lowest = smaller(lowest, costs)
@@ -151,8 +154,8 @@ def search_flags(costs, r, c, span, possible):
         masked |= costs.right_state[r, x] & MASKED != 0
     if usable == 0:
         flags |= RIGHT_MASKED if masked else NO_CANDIDATE
-    elif 0 < possible < span.last + 1 - span.first:
-        flags |= RANGE_INCOMPLETE
+    elif possible < span.last + 1 - span.first and costs.left_state[r, c] == 0:
+        flags |= RANGE_INCOMPLETE if possible > 0 else NO_CANDIDATE
     return flags
 
 

@@ -20,6 +20,7 @@ from sat_intervals.kernels.cost import (
     cost_curve,
     enter_cells,
     padded_to_lanes,
+    possible_count,
     span_at,
 )
 from sat_intervals.kernels.penalties import Gradients, Penalties, fill_row, make_penalties
@@ -176,7 +177,7 @@ def _enter_row(buffers, gradients, settings, r):
     for c in range(possible.size):
         span = span_at(ranges, settings.count, curve.size, c)
         inner = usable[c + span.last + 1] - usable[c + span.first]
-        possible[c] = inner if costs.left_state[r, c] == 0 else 0
+        possible[c] = possible_count(costs.possible, r, c, inner if costs.left_state[r, c] == 0 else 0)
     falling, rising = -r % possible.size, r % possible.size
     enter_row(paths, possible.size, falling, rising, down)
     take_over(paths, around, inside, r, falling, rising, down)
@@ -262,7 +263,7 @@ def sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
                 add_curve(curve, span, volume.sums, place)
             else:
                 cost_curve(candidates, span, r, c, curve)
-            lowest = close_impossible(curve, candidates, span, c)
+            lowest = close_impossible(curve, candidates, span, r, c, settings.impossible)
             winner[i, j], shift, refined, high, low, ambiguity[i, j] = read_curve(curve, span, lowest, settings)
             lower[i, j], upper[i, j] = high
             if settings.steps > 0:

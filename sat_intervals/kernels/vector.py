@@ -105,10 +105,17 @@ def store(builder, data, index, vector):
     builder.store(vector, _vector_at(builder, data, index, _VECTOR), align=2)
 
 
-@_on_array(vector_type)
-def load_bytes(builder, data, index):
-    """Return ``array.ravel()[index : index + 32]`` of a uint8 array, as uint16 lanes."""
-    return builder.zext(builder.load(_vector_at(builder, data, index, _BYTES), align=1), _VECTOR)
+@intrinsic
+def load_costs(typing_context, array, index):
+    """Return ``array.ravel()[index : index + 32]`` of a uint8 or uint16 array, as uint16 lanes."""
+
+    def generate(context, builder, signature, arguments):
+        data, kind = context.make_array(array)(context, builder, arguments[0]).data, _VECTOR
+        if array.dtype == types.uint8:
+            return builder.zext(builder.load(_vector_at(builder, data, arguments[1], _BYTES), align=1), kind)
+        return builder.load(_vector_at(builder, data, arguments[1], kind), align=2)
+
+    return vector_type(array, types.intp), generate
 
 
 @_on_array(float_vector_type)

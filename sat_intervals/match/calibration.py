@@ -5,13 +5,26 @@ shapes.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from math import ceil
-from typing import NamedTuple
+from importlib.metadata import version
+from math import ceil, isfinite
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sat_intervals.config.calibration import Levels
-from sat_intervals.match.measurement import COUNTS, HIGH, INSIDE, MISSED, QUANTILES, WIDTH, WIDTHS, Ladders, Measured
+from sat_intervals.config import Calibration, Config
+from sat_intervals.config.calibration import COVERAGES, Levels
+from sat_intervals.match.measurement import (
+    COUNTS,
+    HIGH,
+    INSIDE,
+    MISSED,
+    QUANTILES,
+    WIDTH,
+    WIDTHS,
+    Ladders,
+    Measured,
+    ladders,
+)
 
 _USUAL_QUANTILE = 0.9
 # Of quantiles whose scores differ by less than this, the one with the narrowest intervals is chosen.
@@ -34,6 +47,33 @@ def pooled(parts: Iterable[Measured]) -> Pool:
     parts = list(parts)
     high, low = np.sum([part.table[0, [HIGH, HIGH + 1], COUNTS:].sum(axis=-1) for part in parts], axis=0)
     return Pool(np.asarray(sum(part.weight * part.table for part in parts)), (int(high), int(low)))
+
+
+def calibration_of_parts(
+    parts: Sequence[Measured], config: Config, name: str, pairs: list[dict[str, Any]], key: dict[str, Any]
+) -> tuple[Calibration, list[dict[str, float]]]:
+    """Return the calibration of measured parts, and what to expect of it: a row for each coverage.
+
+    ``pairs`` are for the provenance; ``key`` names the settings, see `key_of`.
+    """
+    rungs, pool, expected, notes = ladders(config), pooled(parts), [], []
+    chosen: list[Levels] = []
+    for coverage, groups in zip(COVERAGES, left_out(parts, rungs, COVERAGES), strict=True):
+        levels, doubts = choose(pool, rungs, coverage)
+        levels = not_below(levels, chosen[-1] if chosen else None)
+        chosen.append(levels.model_copy(update={"high": round(levels.high, 3), "low": round(levels.low, 2)}))
+        notes += [f"coverage {coverage:g}: {doubt}" for doubt in doubts]
+        expected.append({"coverage": coverage, **means(groups.values())})
+    provenance = {
+        "software": f"sat-intervals {version('sat-intervals')}",
+        "pairs": pairs,
+        "pixels": dict(zip(("high", "low"), pool.pixels, strict=True)),
+        "notes": notes,
+        "expected": [
+            {key: round(value, 4) if isfinite(value) else None for key, value in row.items()} for row in expected
+        ],
+    }
+    return Calibration(name=name, key=key, levels=tuple(chosen), provenance=provenance), expected
 
 
 def choose(pool: Pool, ladders: Ladders, coverage: float) -> tuple[Levels, list[str]]:

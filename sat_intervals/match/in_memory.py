@@ -12,13 +12,15 @@ import xarray as xr
 from sat_intervals.config import Config, load_config, resolved, unreached
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.rows import RowOffsets, shift_rows
+from sat_intervals.match.around import CELL, ranges_around, with_agreement, with_hull
+from sat_intervals.match.labelled import labelled
+from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.memory import check_memory, volume_bytes
 from sat_intervals.match.normalization import Moments, PairStatistics, blocks, moments, statistics_of
 from sat_intervals.match.rows import Survey
 from sat_intervals.match.sampling import look, spots
 from sat_intervals.match.search_range import Found, NoRangeError, find_range, finest_step, reduced, with_range
 from sat_intervals.match.whole import cut, match_whole, whole_view
-from sat_intervals.products import WIDTH, flag_attributes, interval_bands
 from sat_intervals.tiling import Window
 
 _LOG = logging.getLogger(__name__)
@@ -52,19 +54,53 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any] |
     SatIntervalsError
         If the arrays do not fit each other or the search range, or the volume does not fit in memory.
     """
-    config = resolved(load_config(config))
+    return _matched(left, right, load_config(config))
+
+
+def intervals_around(
+    left: Array, right: Array, disparity: Array, config: Config | Mapping[str, Any] | None = None
+) -> xr.Dataset:
+    """Judge the disparities of another matcher: match around them, and look whether they are in the intervals.
+
+    Parameters
+    ----------
+    left, right
+        Images as of `match_arrays`.
+    disparity
+        ``(rows, columns)`` of the left image, ``x_right = x_left + disparity`` in pixels; not finite, or masked, where
+        there is none.
+    config
+        Settings, as `load_config` takes them; by default those of the preset ``satellite``. Cells of 64 x 64 pixels
+        search the range of their disparities with ``disparity.margin`` on both sides; those without any the whole
+        range, which is that of all cells unless it is given.
+
+    Returns
+    -------
+    Dataset
+        That of `match_arrays`, and ``agreement``, float32: 1 where the given disparity is in the interval, 0 where it
+        is not, NaN where one of them is missing. Disparities and intervals are ours: the given ones only decide where
+        is searched.
+
+    Raises
+    ------
+    SatIntervalsError
+        As `match_arrays`; the disparities have another shape than the left image, or there are none.
+    """
+    given = _image(_pixels(disparity, "disparity")).filled(np.nan)
+    local = {"disparity": {"local": True, "grid": None, "around": None}}
+    return _matched(left, right, load_config(load_config(config), local), given)
+
+
+def _matched(left: Array, right: Array, config: Config, given: np.ndarray | None = None) -> xr.Dataset:
+    """Match two images, around ``given`` disparities if there are some."""
+    config = resolved(config)
     if missed := unreached(config):
         _LOG.warning("%s", missed)
     pixels = _pixels(left, "left"), _pixels(right, "right")
     _check_rows(*pixels)
-    ranges = None
-    if config.disparity.grid:
-        raise SatIntervalsError("a raster of local ranges needs files: use match_pair, or disparity local")
-    if config.disparity.is_auto or config.disparity.local:
-        found = _found(_image(pixels[0]), _image(pixels[1]))
-        config = with_range(config, found) if config.disparity.is_auto else config
-        if config.disparity.local:
-            ranges = found.local.clipped(config.disparity.minimum, config.disparity.maximum)
+    if config.disparity.grid or config.disparity.around:
+        raise SatIntervalsError("a raster needs files: use match_pair, or disparity local, or intervals_around")
+    config, ranges = _searched(*pixels, config, given)
     _check_fit(*pixels, config)
     images = _image(pixels[0]), _image(pixels[1])
     rows = None
@@ -76,16 +112,28 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any] |
         statistics = PairStatistics(*(statistics_of(_moments(image)) for image in images))
     final = match_whole(*images, config, statistics, ranges)
     labels = left if isinstance(left, xr.DataArray) else xr.DataArray(images[0], dims=("y", "x"))
-    dataset = xr.Dataset(coords=labels.coords, attrs={"title": "disparity with intervals", "source": "sat-intervals"})
-    dataset.attrs |= {"preset": config.preset} if config.preset else {}
-    dataset.attrs |= {"rows": json.dumps(asdict(rows))} if rows else {}
-    layers = (*final[:4], final.sigma) if config.products.sigma else final[:4]
-    for band, layer in zip(interval_bands(sigma=config.products.sigma), layers, strict=True):
-        attributes = {"long_name": band.meaning} | ({"units": band.unit} if band.unit else {})
-        dataset[band.name] = xr.DataArray(layer, dims=labels.dims, attrs=attributes)
-    dataset["validity"] = xr.DataArray(final.validity, dims=labels.dims, attrs=flag_attributes())
-    dataset["width"] = (dataset["upper"] - dataset["lower"]).assign_attrs(long_name=WIDTH, units="px")
-    return dataset
+    if given is not None:
+        final = with_agreement(final, given)
+    attributes = {"preset": config.preset} if config.preset else {}
+    return labelled(final, labels, attributes | ({"rows": json.dumps(asdict(rows))} if rows else {}))
+
+
+def _searched(
+    left: np.ma.MaskedArray, right: np.ma.MaskedArray, config: Config, given: np.ndarray | None
+) -> tuple[Config, LocalRanges | None]:
+    """Return settings with the search range as numbers, and local ranges, if any."""
+    local = None
+    if given is not None:
+        if given.shape != left.shape:
+            raise SatIntervalsError(f"the disparities are {given.shape}, the left array {left.shape}: give one a pixel")
+        rows = (given[row : row + CELL] for row in range(0, len(given), CELL))
+        local = ranges_around(rows, config.disparity.margin)
+        config = with_hull(config, local, "the array of disparities") if config.disparity.is_auto else config
+    elif config.disparity.is_auto or config.disparity.local:
+        found = _found(_image(left), _image(right))
+        local = found.local if config.disparity.local else None
+        config = with_range(config, found) if config.disparity.is_auto else config
+    return config, local and local.clipped(config.disparity.minimum, config.disparity.maximum)
 
 
 def _pixels(array: Array, side: str) -> np.ma.MaskedArray:

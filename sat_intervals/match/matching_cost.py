@@ -1,19 +1,24 @@
 """Matching costs of areas from the pixels of two views, and gradients for their penalties."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
 
-from sat_intervals.config import Config, Mccnn, MccnnSgm
+from sat_intervals.config import Config, Mccnn, MccnnSgm, Volume
 from sat_intervals.config.weights import weights_file
+from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.correlation import correlate
 from sat_intervals.kernels.cost import Cells, Codes, Costs, between, census, padded_to_lanes, window_state
 from sat_intervals.kernels.penalties import Gradients, Rule
+from sat_intervals.match.costs import MatchingCost, foreign_costs, integer_costs
 from sat_intervals.match.mccnn import RADIUS, Network, load_network
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
 from sat_intervals.tiling import View, Views, Window, facing, hull
+
+VolumeOf = Callable[[np.ma.MaskedArray, np.ma.MaskedArray, int], np.ndarray]
+"""Makes the volume of a tile from both images around it and its first disparity, see `match_pair`."""
 
 # Rows that go through the network at once; few, which limits the memory for features.
 STRIP = 64
@@ -55,14 +60,6 @@ class Area(NamedTuple):
         return self.base if self.mirrored else self.facing
 
 
-class MatchingCost(NamedTuple):
-    """Costs and gradients of an area, with the states of its base's pixels."""
-
-    costs: Costs
-    gradients: Gradients | None
-    state: np.ndarray
-
-
 def view_windows(areas: Sequence[Area], config: Config) -> tuple[Window, Window]:
     """Windows of both images that the costs of areas need; the areas are in the same rows."""
     radius = config.cost.window // 2
@@ -75,18 +72,25 @@ def cost_areas(
     areas: Sequence[Area],
     config: Config,
     statistics: PairStatistics | None = None,
-    network: Network | None = None,
+    network: Network | VolumeOf | None = None,
     made: Sequence[np.ndarray] | None = None,
 ) -> list[MatchingCost]:
     """Costs and gradients of areas of two views.
 
     views: both images in the `view_windows` of the areas.
     statistics: of the whole images; None if the matching cost needs none.
-    network: of MC-CNN; by default that of the settings.
+    network: of MC-CNN, by default that of the settings; or what makes the volumes of another matcher.
     made: precomputed costs of the areas from an earlier call, ``Costs.left``, so that they are not computed again.
     """
+    if isinstance(config.cost, Volume):
+        if made is None:
+            assert network is not None  # a job always comes with it
+            assert not isinstance(network, Network)
+            made = [_values(views, area, config, network) for area in areas]
+        return [foreign_costs(of_area, area.disparities, config) for area, of_area in zip(areas, made, strict=True)]
     if isinstance(config.cost, Mccnn):
         assert statistics is not None  # MC-CNN always comes with statistics
+        assert network is None or isinstance(network, Network)
         if made is None:
             network = network or load_network(weights_file(config.cost.weights))
             made = _correlations(views, areas, statistics, network)
@@ -105,6 +109,20 @@ def cost_areas(
         )
         for area, found in zip(areas, costs, strict=True)
     ]
+
+
+def _values(views: Views, area: Area, config: Config, volume_of: VolumeOf) -> np.ndarray:
+    """Return the integer costs of another matcher's volume of an area."""
+    margin = config.cost.window // 2
+    left, right = (
+        np.ma.array(view.inner(view.pixels, there), mask=view.inner(view.state, there) != 0)
+        for view, there in zip(views, (area.base.grown(margin, margin), area.facing.grown(margin, margin)), strict=True)
+    )
+    values = np.asarray(volume_of(left, right, area.minimum))
+    needed = (area.base.height, area.base.width, area.disparities)
+    if values.shape != needed or values.dtype.kind not in "uif":
+        raise SatIntervalsError(f"volume_of returned {values.shape} of {values.dtype}, needed are {needed} numbers")
+    return integer_costs(values, config)
 
 
 def _of_area(area: Area, views: Views, arrays: Sequence[np.ndarray], radius: int) -> tuple[np.ndarray, np.ndarray]:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.config import Census, Mccnn
+from sat_intervals.config import Census, Mccnn, Volume
 from sat_intervals.config.weights import INSTALL_MCCNN, weights_file
 from sat_intervals.errors import ChangedInputError, SatIntervalsError
 
@@ -93,8 +93,10 @@ def load_network(file: Path) -> Network:
     return _loaded(_Weights.of(file))
 
 
-def network_of(cost: Census | Mccnn, inputs: Mapping[str, Any]) -> Network | None:
+def network_of(cost: Census | Mccnn | Volume, inputs: Mapping[str, Any]) -> Network | None:
     """Return the network of a run with these inputs, on any worker; None if its cost needs none."""
+    if isinstance(cost, Volume):
+        raise SatIntervalsError(f"the costs of this run are those of {cost.name}, which only match_pair calls")
     if not isinstance(cost, Mccnn):
         return None
     weights = _Weights.of(weights_file(cost.weights))

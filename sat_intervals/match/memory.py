@@ -40,7 +40,7 @@ def tiles_together(config: Config, size: int) -> int:
 
 def volume_bytes(height: int, width: int, config: Config) -> int:
     """Bytes of the cost volume, the largest part of matching, and of precomputed matching costs."""
-    return (3 if config.cost.precomputed else 2) * height * width * padded_to_lanes(config.disparity.count)
+    return (2 + config.cost.precomputed) * height * width * padded_to_lanes(config.disparity.count)
 
 
 def tile_bytes(config: Config, size: int | None = None) -> int:
@@ -53,7 +53,7 @@ def tile_bytes(config: Config, size: int | None = None) -> int:
     if accurate:
         volume = 2 * size * (size + config.disparity.count) * lanes  # the volume of the right view is wider
     if config.cost.precomputed:
-        volume += lanes * patch * (patch + accurate * (patch + config.disparity.count))
+        volume += config.cost.precomputed * lanes * patch * (patch + accurate * (patch + config.disparity.count))
     if isinstance(config.cost, Mccnn):
         volume += _NETWORK_BYTES * (patch + config.disparity.count)
     paths = 2 * 3 * (patch + config.disparity.count) * lanes
@@ -76,7 +76,7 @@ def waiting_bytes(config: Config, size: int | None = None) -> int:
 def strip_bytes(rows: int, width: int, config: Config) -> int:
     """Bytes that finishing a strip of final rows needs on top of its process."""
     piece = (_PIECE_BYTES + config.fits * _FIT_BYTES) * max(STRIP_PIXELS, _PIECE_ROWS * width)
-    bands, facing = rows * width * (_BAND_BYTES + 6 * config.products.sigma), width + config.disparity.count
+    bands, facing = rows * width * (_BAND_BYTES + 6 * len(config.extra_bands)), width + config.disparity.count
     writing = bands // 2 + rows * min(width, _COLUMNS) * _BLOCK_BYTES
     reading = rows * facing * _READING_BYTES if config.fits and config.rows == "auto" else 0
     return max(reading, bands + config.fits * rows * facing * _IMAGES_BYTES + piece, bands + writing)

@@ -5,13 +5,14 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from sat_intervals.config import Config, Disparity, Sgm
+from sat_intervals.config import Config, Disparity, Sgm, Volume
 from sat_intervals.kernels.cost import Cells
 from sat_intervals.kernels.matching import Raw, RightView, match_costs
 from sat_intervals.kernels.sgm import Borders, Edge
 from sat_intervals.kernels.sweeps import Settings
+from sat_intervals.match.costs import MatchingCost
 from sat_intervals.match.local_ranges import LocalRanges, narrowed
-from sat_intervals.match.matching_cost import Area, MatchingCost, cost_areas, textureless, view_windows
+from sat_intervals.match.matching_cost import Area, cost_areas, textureless, view_windows
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.products import IMPOSSIBLE_COST, LEFT_MASKED, MASKED, MISMATCH, NO_DISPARITY, RANGE_END
 from sat_intervals.tiling import Views, Window, facing
@@ -177,7 +178,7 @@ def match_patch(
 
 
 def match_costed(
-    views: Views,
+    views: Views | None,
     frame: Frame,
     costs: Sequence[MatchingCost],
     config: Config,
@@ -186,6 +187,7 @@ def match_costed(
 ) -> Patch:
     """Match a core as `match_patch` does, from the costs of its `patch_areas`.
 
+    ``views`` find textureless pixels, which a foreign volume does not know.
     ``borders`` are path states of the neighbours for each area; by default every path starts where its area does.
     """
     is_exact, core = config.tiles.overlap == "exact", frame.core
@@ -208,7 +210,10 @@ def match_costed(
         right = _of_whole_range(right, right_core, settings)
     inside = output.relative_to(area.base).slices
     raw.validity[cost.state[inside] & MASKED != 0] |= LEFT_MASKED
-    flat = textureless(views, area, cost.costs, config, cells)[inside]
+    if views is None or isinstance(config.cost, Volume):
+        flat = np.zeros((output.height, output.width), np.bool_)
+    else:
+        flat = textureless(views, area, cost.costs, config, cells)[inside]
     _mark_ambiguous(raw, flat, config)
     _mark_ends(raw, flat, config.disparity)
     if ranges:

@@ -2,13 +2,14 @@
 
 import numpy as np
 
-from sat_intervals.config import Config
+from sat_intervals.config import Config, Volume
+from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.kernels.sgm import WAVEFRONTS
 from sat_intervals.match.borders import borders_of, trace_area
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.matching_cost import cost_areas
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
-from sat_intervals.match.patch import Frame, frame_area, match_patch, patch_windows
+from sat_intervals.match.patch import Frame, frame_area, match_costed, patch_areas, patch_windows
 from sat_intervals.match.postprocess import ConfidenceScale, postprocess_strips
 from sat_intervals.match.whole import whole_rows
 from sat_intervals.tiling import View, Window
@@ -31,8 +32,12 @@ def compile_kernels(config: Config, *, hands_states_on: bool = True) -> None:
     )
     statistics = PairStatistics(ImageStatistics(0.5, 0.3), ImageStatistics(0.5, 0.3))
     views = left, right
-    patch = match_patch(views, frame, config, statistics, ranges)
+    area = frame_area(frame, config, ranges)
+    zeros = np.zeros((area.base.height, area.base.width, padded_to_lanes(area.disparities)), np.uint16)
+    made = [zeros] if isinstance(config.cost, Volume) else None
+    costs = cost_areas(views, patch_areas(frame, config, ranges), config, statistics, made=made)
+    patch = match_costed(views, frame, costs, config, ranges=ranges)
     if hands_states_on and config.hands_states_on:
-        (cost,) = cost_areas(views, [frame_area(frame, config, ranges)], config, statistics)
+        (cost,) = cost_areas(views, [area], config, statistics, made=made)
         trace_area(cost, frame, borders_of(frame, config, [{} for _ in WAVEFRONTS]), 0, config, ranges)
     list(postprocess_strips([whole_rows(patch, views, frame.whole, config)], ConfidenceScale(0.0, 1.0), config))

@@ -30,12 +30,20 @@ def match_whole(
     whole = whole_view(left), whole_view(right)
     views = cut(whole[0], windows[0]), cut(whole[1], windows[1])
     patch = match_patch(views, frame, config, statistics, ranges)
-    raw, scale = patch.raw, ConfidenceScale(np.nan, np.nan)
-    if config.ambiguity:
-        histogram = ambiguity_histogram(raw.ambiguity, raw.winner != NO_DISPARITY, config.largest_ambiguity)
-        scale = confidence_scale(config.ambiguity, histogram)
-    rows = whole_rows(patch, whole, frame.whole, config)
-    return postprocess_rows(rows, 0, frame.whole.height, scale, config)
+    return finish_whole(whole_rows(patch, whole, frame.whole, config), config)
+
+
+def scale_of_rows(rows: RawRows, config: Config) -> ConfidenceScale:
+    """Return the scale of confidence of a whole image."""
+    if config.ambiguity is None:
+        return ConfidenceScale(np.nan, np.nan)
+    histogram = ambiguity_histogram(rows.ambiguity, rows.winner != NO_DISPARITY, config.largest_ambiguity)
+    return confidence_scale(config.ambiguity, histogram)
+
+
+def finish_whole(rows: RawRows, config: Config) -> Bands:
+    """Return the final bands of the rows of a whole image."""
+    return postprocess_rows(rows, 0, len(rows.winner), scale_of_rows(rows, config), config)
 
 
 def whole_rows(patch: Patch, views: Views, window: Window, config: Config) -> RawRows:

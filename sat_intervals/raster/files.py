@@ -1,6 +1,6 @@
 """Metadata of the files of a run, from the tables of `sat_intervals.products`."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 
 from rasterio.io import DatasetWriter
@@ -47,9 +47,9 @@ VALIDITY = File("validity.tif", "uint16", None, (_VALIDITY,), _FLAG_TAGS)
 RUN_FILES = (INTERVALS, VALIDITY)
 
 
-def run_files(compression: str, *, sigma: bool = False) -> tuple[File, File]:
-    """Return the files of a run with the compression of the settings, and with the band of deviations."""
-    intervals = replace(INTERVALS, compression=compression, bands=interval_bands(sigma=sigma))
+def run_files(compression: str, extra: Collection[str] = ()) -> tuple[File, File]:
+    """Return the files of a run with the compression of the settings, and with extra bands, see `interval_bands`."""
+    intervals = replace(INTERVALS, compression=compression, bands=interval_bands(extra))
     return intervals, replace(VALIDITY, compression=compression)
 
 

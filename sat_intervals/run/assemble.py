@@ -12,9 +12,9 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError
+from sat_intervals.errors import REPORT, ChangedInputError, RunError, SatIntervalsError
 from sat_intervals.match.postprocess import ConfidenceScale, confidence_scale
-from sat_intervals.progress import REPORT, Progress, logged_stage
+from sat_intervals.progress import Progress, logged_stage
 from sat_intervals.raster import OutputError, OutputWriter, Part
 from sat_intervals.raster.publishing import new_file
 from sat_intervals.run.inputs import check_unchanged

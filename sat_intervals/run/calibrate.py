@@ -1,18 +1,15 @@
 """Calibrations from pairs with truth."""
 
 import logging
-import math
 from collections.abc import Sequence
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
 from sat_intervals.config import Calibration, key_of
-from sat_intervals.config.calibration import COVERAGES, Levels
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.match.calibration import choose, left_out, means, not_below, pooled
-from sat_intervals.match.measurement import Measured, ladders
+from sat_intervals.match.calibration import calibration_of_parts
+from sat_intervals.match.measurement import Measured
 from sat_intervals.match.memory import STRIP_PIXELS
 from sat_intervals.run.checks import checked_region
 from sat_intervals.run.measure import Subject, check_enough
@@ -74,28 +71,11 @@ def calibration_from(
     parts: Sequence[Measured], subjects: Sequence[Subject], name: str, key: dict[str, Any] | None = None
 ) -> tuple[Calibration, list[dict[str, float]]]:
     """Return the calibration of measured subjects, and what to expect of it: a row for each coverage."""
+    pairs = [
+        {"name": subject.name, "group": subject.group, "search_range": [search.minimum, search.maximum]}
+        | {"tolerance": subject.tolerance, "remove_bias": subject.remove_bias}
+        for subject in subjects
+        for search in (subject.config.disparity,)
+    ]
     config = subjects[0].config
-    rungs, pool, expected, notes = ladders(config), pooled(parts), [], []
-    chosen: list[Levels] = []
-    for coverage, groups in zip(COVERAGES, left_out(parts, rungs, COVERAGES), strict=True):
-        levels, doubts = choose(pool, rungs, coverage)
-        levels = not_below(levels, chosen[-1] if chosen else None)
-        chosen.append(levels.model_copy(update={"high": round(levels.high, 3), "low": round(levels.low, 2)}))
-        notes += [f"coverage {coverage:g}: {doubt}" for doubt in doubts]
-        expected.append({"coverage": coverage, **means(groups.values())})
-    provenance = {
-        "software": f"sat-intervals {version('sat-intervals')}",
-        "pairs": [
-            {"name": subject.name, "group": subject.group, "search_range": [search.minimum, search.maximum]}
-            | {"tolerance": subject.tolerance, "remove_bias": subject.remove_bias}
-            for subject in subjects
-            for search in (subject.config.disparity,)
-        ],
-        "pixels": dict(zip(("high", "low"), pool.pixels, strict=True)),
-        "notes": notes,
-        "expected": [
-            {key: round(value, 4) if math.isfinite(value) else None for key, value in row.items()} for row in expected
-        ],
-    }
-    calibration = Calibration(name=name, key=key or key_of(config), levels=tuple(chosen), provenance=provenance)
-    return calibration, expected
+    return calibration_of_parts(parts, config, name, pairs, key or key_of(config))

@@ -8,11 +8,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Protocol
 
-from sat_intervals.config import Config, load_config, resolved
+from sat_intervals.config import Config, Volume, load_config, resolved
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.kernels.rows import RowOffsets
 from sat_intervals.match.local_ranges import LocalRanges
+from sat_intervals.match.matching_cost import VolumeOf
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.rows import Survey
 from sat_intervals.match.schedule import blocks_of, handed_bytes
@@ -60,7 +61,8 @@ class Job:
 
     ``requested`` is the section ``disparity`` as given, ``found`` the result of the search for a range, ``local`` the
     local ranges, which workers read from the store. With ``overwrite``, files and another run in ``out`` may be
-    replaced. `calibrate` makes no files of its tiles: ``has_files`` is False.
+    replaced. `calibrate` makes no files of its tiles: ``has_files`` is False. ``volume_of`` makes the volumes of
+    another matcher; its name is in the settings.
     """
 
     left: Image
@@ -76,6 +78,7 @@ class Job:
     local: LocalRanges | None = None
     overwrite: bool = False
     has_files: bool = True
+    volume_of: VolumeOf | None = None
 
     @property
     def manifest(self) -> dict[str, Any]:
@@ -211,6 +214,8 @@ def prepare(
     Without ``find`` rows are not looked at.
     """
     config, out = resolved(load_config(config)), Path(out)
+    if isinstance(config.cost, Volume) and config.cost.name is None:
+        raise SatIntervalsError("cost.method volume needs the function that makes volumes: give match_pair volume_of")
     requested = config.disparity.model_dump(mode="json")
     left, right = checked_pair(left, right, config)
     images = left, right

@@ -8,11 +8,13 @@ import numpy as np
 from sat_intervals.config import Config
 from sat_intervals.config.sections import MOST_PIXELS
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.match.around import CELL, ranges_around, with_hull
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.search_range import Found, with_range
 from sat_intervals.products import RANGES
 from sat_intervals.raster import (
     Image,
+    Layer,
     OutputWriter,
     open_image,
     ranges_file,
@@ -23,8 +25,8 @@ from sat_intervals.raster.identity import identity
 from sat_intervals.raster.published import tag_of_left, tags_beside
 from sat_intervals.tiling import Window
 
-# Side of the cells that a raster of ranges is reduced to, in pixels, and rows that are written at a time.
-_CELL, _STRIP = 64, 256
+# Rows that are written at a time.
+_STRIP = 256
 
 
 def searched(config: Config, left: Image, find: Callable[[], Found]) -> tuple[Config, Found | None, LocalRanges | None]:
@@ -33,7 +35,10 @@ def searched(config: Config, left: Image, find: Callable[[], Found]) -> tuple[Co
     if search.grid:
         tags_beside(search.grid, identity(left.path))
         local = read_ranges(search.grid, left)
-        config = _with_range_of(config, local) if search.is_auto else config
+        config = with_hull(config, local, search.grid) if search.is_auto else config
+    elif search.around:
+        local = _ranges_around(search.around, left, search.margin)
+        config = with_hull(config, local, search.around) if search.is_auto else config
     elif search.is_auto or search.local:
         found = find()
         local = found.local if search.local else None
@@ -41,13 +46,23 @@ def searched(config: Config, left: Image, find: Callable[[], Found]) -> tuple[Co
     return config, found, local and local.clipped(config.disparity.minimum, config.disparity.maximum)
 
 
-def _with_range_of(config: Config, raster: LocalRanges) -> Config:
-    """Return settings with the hull of a raster of ranges as search range."""
-    known = raster.minimum <= raster.maximum
-    if not known.any():
-        raise SatIntervalsError(f"{config.disparity.grid} has no data: give another raster, or the search range")
-    ends = {"minimum": int(raster.minimum[known].min()), "maximum": int(raster.maximum[known].max())}
-    return config.model_copy(update={"disparity": config.disparity.model_copy(update=ends)})
+def _ranges_around(path: str, left: Image, margin: int) -> LocalRanges:
+    """Read the disparities of another matcher, and return the ranges around them."""
+    raster = open_image(path, band=1)
+    if (raster.height, raster.width) != (left.height, left.width):
+        raise SatIntervalsError(
+            f"{path} has {raster.height} x {raster.width} pixels, {left.path} {left.height} x {left.width}: give the "
+            "disparity of each pixel of the left image"
+        )
+    _check_grid(raster, left)
+    windows = (Window(row, 0, min(CELL, left.height - row), left.width) for row in range(0, left.height, CELL))
+    return ranges_around((Layer(raster, 0, 0).read(window) for window in windows), margin)
+
+
+def given_disparities(config: Config, window: Window) -> np.ndarray | None:
+    """Read the disparities of another matcher in a window of the left image, NaN for none; None if none are given."""
+    path = config.disparity.around
+    return Layer(open_image(path, band=1), 0, 0).read(window) if path else None
 
 
 def write_ranges(path: Path, ranges: LocalRanges, left: Image) -> None:
@@ -70,15 +85,18 @@ def read_ranges(path: str, left: Image) -> LocalRanges:
             "minimum and maximum for each pixel of the left image"
         )
     images = [open_image(path, band=band) for band in (1, 2)]
-    here, there = images[0].georeferencing, left.georeferencing
+    _check_grid(images[0], left)
+    rows = [_row_of_cells(images, Window(row, 0, min(CELL, height - row), width)) for row in range(0, height, CELL)]
+    minimum, maximum = (np.stack(bound) for bound in zip(*rows, strict=True))
+    return LocalRanges(minimum, maximum, CELL, CELL)
+
+
+def _check_grid(raster: Image, left: Image) -> None:
+    here, there = raster.georeferencing, left.georeferencing
     if here.crs and there.crs and (here.crs, here.transform) != (there.crs, there.transform):
         raise SatIntervalsError(
-            f"{path} and {left.path} have different georeferencing: give a raster of ranges on the grid of the left "
-            "image"
+            f"{raster.path} and {left.path} have different georeferencing: give a raster on the grid of the left image"
         )
-    rows = [_row_of_cells(images, Window(row, 0, min(_CELL, height - row), width)) for row in range(0, height, _CELL)]
-    minimum, maximum = (np.stack(bound) for bound in zip(*rows, strict=True))
-    return LocalRanges(minimum, maximum, _CELL, _CELL)
 
 
 def _row_of_cells(images: list[Image], window: Window) -> tuple[np.ndarray, np.ndarray]:
@@ -91,7 +109,7 @@ def _row_of_cells(images: list[Image], window: Window) -> tuple[np.ndarray, np.n
             f"{images[0].path} has minimum {low[row, column]:g} above maximum {high[row, column]:g} at row "
             f"{window.row + row}, column {column}: swap the bands"
         )
-    starts = np.arange(0, window.width, _CELL)
+    starts = np.arange(0, window.width, CELL)
     least = np.minimum.reduceat(np.floor(low).min(axis=0), starts)
     most = np.maximum.reduceat(np.ceil(high).max(axis=0), starts)
     has_gap = np.logical_or.reduceat(empty.any(axis=0), starts)

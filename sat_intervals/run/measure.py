@@ -4,30 +4,25 @@ import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from decimal import Decimal
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from sat_intervals.config import Calibration, Config, Interval, key_of
-from sat_intervals.config.calibration import COVERAGES
+from sat_intervals.config import Config, key_of
 from sat_intervals.config.sections import Refinement
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.match.gauge import OF_FITS, Gauge, at_levels, block_numbers, pairs_of
 from sat_intervals.match.histogram import bias_histogram
-from sat_intervals.match.measurement import FIELDS, HIGH, QUANTILES, SCHEMES, Ladders, Measured, ladders, measure
+from sat_intervals.match.measurement import QUANTILES, Ladders, Measured, ladders
 from sat_intervals.match.postprocess import (
     ConfidenceScale,
-    Filtered,
     RawRows,
     filter_rows,
     halo,
-    regularized,
-    widened,
     with_halo,
 )
-from sat_intervals.match.refinement import bounds_of_both
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.products import INVALID
 from sat_intervals.progress import Progress
@@ -44,10 +39,6 @@ from sat_intervals.store.lock import locked
 from sat_intervals.tiling import Window
 
 FEWEST = 1000  # pixels with truth, of all pairs
-# A single pair is judged in blocks, this many along each side.
-_BLOCKS = 4
-# In place of a rung of levels: the cut that factors are of.
-_OF_FITS = -1
 
 
 @dataclass(frozen=True)
@@ -95,7 +86,7 @@ def measure_subjects(
     """Match subjects at every level of the ladder, in ``folder``; return measurements, and the `key_of` settings."""
     found: list[Measured] = []
     key, rungs = key_of(subjects[0].config), ladders(subjects[0].config)
-    compile_kernels(_at_levels(subjects[0].config, 0.0, 0.0, QUANTILES[-1]))
+    compile_kernels(at_levels(subjects[0].config, 0.0, 0.0, QUANTILES[-1]))
     with _scratch(folder) as scratch, Connection(subjects[0].config.cluster, scratch) as workers:
         for number, subject in enumerate(subjects):
             one = progress if len(subjects) == 1 else partial(_of_all, progress, "subjects", number, len(subjects))
@@ -128,9 +119,9 @@ def _of_subject(
     workers: Workers, subject: Subject, rungs: Ladders, folder: Path, in_blocks: bool, progress: Progress
 ) -> list[Measured]:
     """Match a subject, with two levels of the ladder at a time, and measure it."""
-    gauge: _Gauge | None = None
+    gauge: _SubjectGauge | None = None
     with ExitStack() as stack:
-        find, pairs = Finder(workers, progress), _pairs(rungs)
+        find, pairs = Finder(workers, progress), pairs_of(rungs)
         jobs = [_begun(find, subject, rungs, pair, folder / str(pair[1]), stack) for pair in pairs]
         # several tiles of one job keep all workers busy; stores of all jobs at once would fill the disk
         batches = [jobs] if len(jobs[0].store.grid) == 1 else [[job] for job in jobs]
@@ -143,27 +134,21 @@ def _of_subject(
             for matched in match_jobs(workers, batch, step):
                 job = matched.job
                 check_failures(job, matched.failures)
-                gauge = gauge or _Gauge(job, subject, rungs, in_blocks)
+                gauge = gauge or _SubjectGauge(job, subject, rungs, in_blocks)
                 gauge.add(job, pairs[jobs.index(job)])
                 job.store.remove()
         check_unchanged(jobs[0].inputs, subject.left, subject.right, jobs[0].config)
     assert gauge is not None  # there are jobs
-    return gauge.measured()
-
-
-def _pairs(rungs: Ladders) -> list[tuple[int, int]]:
-    """Return the rungs of levels that each job matches; _OF_FITS is the cut that factors are of."""
-    numbers = [*([] if rungs.are_one else [_OF_FITS]), *range(rungs.low.size)]
-    return list(zip(numbers[::2], [*numbers[1::2], *numbers[-1:]], strict=False))
+    return gauge.gauge.measured()
 
 
 def _begun(find: Finder, subject: Subject, rungs: Ladders, pair: tuple[int, int], out: Path, stack: ExitStack) -> Job:
     """Prepare the job that matches a subject at two rungs; open its store."""
-    high, low = (subject.config.fit_cut if rung == _OF_FITS else float(rungs.low[rung]) for rung in pair)
+    high, low = (subject.config.fit_cut if rung == OF_FITS else float(rungs.low[rung]) for rung in pair)
     config = subject.config
     if config.fits:  # its tiles are those of V-fit, at any levels
         config = config.model_copy(update={"refinement": Refinement(method="vfit")})
-    config = _at_levels(config, high, low, None)
+    config = at_levels(config, high, low, None)
     job = prepare(subject.left, subject.right, out, config, window=subject.window, pair=out.parent.name, find=find)
     job = replace(job, has_files=False)
     job.begin()
@@ -171,60 +156,15 @@ def _begun(find: Finder, subject: Subject, rungs: Ladders, pair: tuple[int, int]
     return job
 
 
-def _at_levels(config: Config, high: float, low: float, quantile: float | None) -> Config:
-    """Return settings whose intervals are cut at two levels, whatever the coverage, and without local ranges."""
-    rows = [{"coverage": coverage, "high": high, "low": low, "quantile": quantile} for coverage in COVERAGES]
-    constant = Calibration.model_validate({"name": "constant", "key": key_of(config), "levels": rows})
-    interval = Interval(coverage=Decimal(str(COVERAGES[0])), calibration=constant)
-    disparity = config.disparity.model_copy(update={"local": False, "grid": None})
-    return config.model_copy(update={"interval": interval, "disparity": disparity})
-
-
-class _Piece(NamedTuple):
-    """Rows with their halo, the range of those that are measured, and their truths and parts."""
-
-    rows: Filtered
-    first: int
-    last: int
-    truth: np.ndarray
-    parts: np.ndarray
-
-    @property
-    def inner(self) -> slice:
-        """Return the rows that are measured."""
-        return slice(self.first, self.last)
-
-    def of(self, name: str) -> np.ndarray:
-        """Return a band of the rows that are measured."""
-        return np.asarray(getattr(self.rows, name)[self.inner])
-
-    @property
-    def kept(self) -> np.ndarray:
-        """Return the mask of valid pixels."""
-        return np.asarray(self.of("validity") & INVALID == 0)
-
-
-class _Gauge:
+class _SubjectGauge:
     """Measures the intervals of a subject, job by job."""
 
     def __init__(self, job: Job, subject: Subject, rungs: Ladders, in_blocks: bool) -> None:
-        self._subject, self._in_blocks, self._rungs = subject, in_blocks, rungs
+        self._subject, self._in_blocks = subject, in_blocks
         region = job.store.grid.region
         self._shape = region.height, region.width
-        parts = _BLOCKS**2 if in_blocks else 1
-        self._tables = np.zeros((parts, rungs.low.size, SCHEMES, FIELDS))
-        self._known, self._good = np.zeros((2, parts))
+        self.gauge = Gauge(rungs, subject.group, subject.tolerance, in_blocks=in_blocks)
         self._bias = self._found_bias(job) if subject.remove_bias else 0.0
-
-    def measured(self) -> list[Measured]:
-        """Return the measurement of each part."""
-        names = [f"block {part}" for part in range(len(self._tables))] if self._in_blocks else [self._subject.group]
-        parts = [
-            Measured(name, 1.0, table, int(known), int(good))
-            for name, table, known, good in zip(names, self._tables, self._known, self._good, strict=True)
-        ]
-        kept = sum(part.kept for part in parts)
-        return [part._replace(weight=1 / max(kept, 1)) for part in parts]
 
     def _found_bias(self, job: Job) -> float:
         histogram = bias_histogram()
@@ -238,61 +178,17 @@ class _Gauge:
     def _truth(self, row: int, height: int) -> np.ndarray:
         return self._subject.truth.read(Window(row, 0, height, self._shape[1]))
 
-    def _parts(self, row: int, height: int) -> np.ndarray:
-        """Number of the part of each pixel of some rows."""
-        if not self._in_blocks:
-            return np.zeros((height, self._shape[1]), np.int64)
-        rows, columns = (np.arange(side) * _BLOCKS // side for side in self._shape)
-        return _BLOCKS * rows[row : row + height, None] + columns
-
     def add(self, job: Job, pair: tuple[int, int]) -> None:
-        """Measure a job, whose cuts are a pair of rungs, see `_pairs`."""
+        """Measure a job, whose cuts are a pair of rungs, see `pairs_of`."""
         config = self._config(job)
         for row, strip, first, last, scale in _strips(job, config):
-            truth, parts = self._truth(row, last - first) + self._bias, self._parts(row, last - first)
-            for rung, names in zip(dict.fromkeys(pair), (("lower", "upper"), ("lower_low", "upper_low")), strict=False):
-                lower, upper = (getattr(strip, name) for name in names)
-                rows = filter_rows(
-                    strip._replace(lower=lower, upper=upper, lower_low=lower, upper_low=upper), scale, config
-                )
-                piece = _Piece(rows, first, last, truth, parts)
-                if rung == (0 if self._rungs.are_one else _OF_FITS):
-                    self._count(piece)
-                for number, scheme, bounds in self._bounds(piece, rung, config):
-                    self._tables[:, number, scheme] += self._measured(piece, scheme, bounds, config)
+            truth, parts = self._truth(row, last - first) + self._bias, block_numbers(row, last - first, self._shape)
+            if not self._in_blocks:
+                parts[:] = 0
+            self.gauge.add(strip, slice(first, last), scale, (truth, parts), pair, config)
 
     def _config(self, job: Job) -> Config:
         return job.config.model_copy(update={"refinement": self._subject.config.refinement})
-
-    def _bounds(
-        self, piece: _Piece, rung: int, config: Config
-    ) -> Iterator[tuple[int, int, tuple[np.ndarray, np.ndarray]]]:
-        """Yield the rungs and schemes that a piece is measured for, and their bounds."""
-        if rung == _OF_FITS:
-            fits, lower, upper = piece.rows.fits(piece.inner), piece.of("lower"), piece.of("upper")
-            for number, factor in enumerate(self._rungs.high):
-                yield number, HIGH, bounds_of_both(fits, lower, upper, factor, config)
-            return
-        for scheme, quantile in enumerate((None, *QUANTILES)):
-            if scheme != HIGH or self._rungs.are_one:
-                yield rung, scheme, regularized(piece.rows, piece.first, piece.last, config, quantile)
-
-    def _count(self, piece: _Piece) -> None:
-        """Count pixels with truth, and good ones."""
-        near = piece.kept & (abs(piece.of("disparity") - piece.truth) <= 1)
-        for counts, chosen in ((self._known, np.isfinite(piece.truth)), (self._good, near)):
-            counts += np.bincount(piece.parts[chosen], minlength=counts.size)
-
-    def _measured(
-        self, piece: _Piece, scheme: int, bounds: tuple[np.ndarray, np.ndarray], config: Config
-    ) -> np.ndarray:
-        """Measure the bounds of the kept pixels of a scheme's class."""
-        chosen = np.flatnonzero(piece.kept & np.isfinite(piece.truth) & (piece.of("low") == (scheme != HIGH)))
-        middle, lower, upper, true, part = (
-            band.ravel()[chosen] for band in (piece.of("disparity"), *bounds, piece.truth, piece.parts)
-        )
-        lower, upper = widened(lower, upper, middle, config)
-        return measure(lower, upper, true, self._subject.tolerance, part, len(self._tables))
 
 
 def _strips(job: Job, config: Config) -> Iterator[tuple[int, RawRows, int, int, ConfidenceScale]]:

@@ -3,11 +3,13 @@
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
-from sat_intervals.config import load_config
+from sat_intervals.config import Config, ConfigError, Volume, load_config
 from sat_intervals.errors import RunError
+from sat_intervals.match.matching_cost import VolumeOf
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics, blocks, statistics_of
 from sat_intervals.match.schedule import Schedule
 from sat_intervals.match.warm_up import compile_kernels
@@ -39,6 +41,7 @@ def match_pair(
     keep_tiles: bool = False,
     overwrite: bool = False,
     progress: Progress = lambda stage, done, total: None,
+    volume_of: VolumeOf | None = None,
 ) -> dict[str, Any]:
     """Match two epipolar GeoTIFFs, files to files.
 
@@ -60,6 +63,14 @@ def match_pair(
         Whether another run in ``out`` may be replaced; its tiles are deleted, equal ones are used again.
     progress
         Called regularly with stage, done and total.
+    volume_of
+        Makes the cost volumes of a matcher of one's own, tile by tile, with ``cost`` ``{method: volume, kind: cost,
+        span: 24, margin: 3}`` in the settings, see `intervals_of`. Called as ``volume_of(left, right, first)`` with
+        masked float arrays: the pixels of a tile with ``margin`` on all sides, those of the right image that face them,
+        ``disparities - 1`` more columns, and the first disparity. Returns ``(rows, columns, disparities)`` without the
+        margin, not finite where impossible: candidate k of pixel ``(r, c)``, at ``left[r + margin, c + margin]``, is
+        ``right[r + margin, c + k + margin]``. Where workers are processes it must be picklable; its module and name,
+        not its code, identify the run. With ``sgm`` tiles join without seams; without it volumes are taken as they are.
 
     Returns
     -------
@@ -72,11 +83,12 @@ def match_pair(
     RunError
         Tiles failed; no output was published.
     """
-    config, out, seconds = load_config(config), Path(out), dict[str, float]()
+    config, out, seconds = _named(load_config(config), volume_of), Path(out), dict[str, float]()
     with Connection(config.cluster, out) as connection:
         with logged_stage(seconds, "start"):
             finder = Finder(connection, progress, seconds)
             job = prepare(left, right, out, config, window=window, overwrite=overwrite, find=finder)
+            job = replace(job, volume_of=volume_of)
         with locked(out):
             if not job.begin():
                 report = complete_before(job)
@@ -88,6 +100,16 @@ def match_pair(
                 report = match_and_assemble(job, connection, seconds, progress)
             end_tiles(job, keep_tiles=keep_tiles)
             return report
+
+
+def _named(config: Config, volume_of: VolumeOf | None) -> Config:
+    """Return settings with the name of the function that makes volumes; raise if they ask for another cost."""
+    if not isinstance(config.cost, Volume):
+        if volume_of is not None:
+            raise ConfigError(f"volume_of is given, but cost.method is {config.cost.method}: give cost.method volume")
+        return config
+    name = volume_of and f"{volume_of.__module__}.{getattr(volume_of, '__qualname__', type(volume_of).__qualname__)}"
+    return config.model_copy(update={"cost": config.cost.model_copy(update={"name": name})})
 
 
 def complete_before(job: Job) -> dict[str, Any]:

@@ -5,8 +5,9 @@ from typing import NamedTuple
 import numpy as np
 
 from sat_intervals.kernels.cost import padded_to_lanes
+from sat_intervals.match.costs import MatchingCost
 from sat_intervals.match.local_ranges import LocalRanges
-from sat_intervals.match.matching_cost import MatchingCost, cost_areas, view_windows
+from sat_intervals.match.matching_cost import VolumeOf, cost_areas, view_windows
 from sat_intervals.match.mccnn import Network, network_of
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.patch import Frame, patch_areas
@@ -21,11 +22,14 @@ from sat_intervals.tiling import Tile, Views, Window, hull
 
 
 class Source(NamedTuple):
-    """Both images in windows that contain those of some tiles, with the image statistics and the network of MC-CNN."""
+    """Both images in windows that contain those of some tiles, the image statistics, and what makes costs.
+
+    network: of MC-CNN, or the function that makes the volumes of another matcher; None for others.
+    """
 
     views: Views
     statistics: PairStatistics | None
-    network: Network | None
+    network: Network | VolumeOf | None
 
 
 def frame_of(job: Job, tile: Tile) -> Frame:
@@ -36,7 +40,7 @@ def frame_of(job: Job, tile: Tile) -> Frame:
 def read_source(job: Job, block: Tile, ranges: LocalRanges | None, seconds: dict[str, float]) -> Source:
     """Read both images in the windows of a block's tiles."""
     job.check_version()  # before any work
-    statistics, network = job.statistics(), network_of(job.config.cost, job.inputs)
+    statistics, network = job.statistics(), job.volume_of or network_of(job.config.cost, job.inputs)
     areas = (patch_areas(frame_of(job, tile), job.config, ranges) for tile in job.store.grid.within(block.core))
     windows = [view_windows(of_tile, job.config) for of_tile in areas]
     left, right = map(hull, zip(*windows, strict=True))

@@ -22,7 +22,7 @@ NextStep = Literal["start", "resume", "start anew", "complete"]
 
 def files_of_run(config: Config) -> tuple[File, File]:
     """Return the files that a run writes."""
-    return run_files(config.products.compression, sigma=config.products.sigma)
+    return run_files(config.products.compression, config.extra_bands)
 
 
 def read_report(out: Path) -> dict[str, Any] | None:

@@ -11,6 +11,7 @@ import numpy as np
 from sat_intervals.config import Config
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match import postprocess, refinement
+from sat_intervals.match.around import with_agreement
 from sat_intervals.match.memory import STRIP_PIXELS
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, halo, postprocess_strip
 from sat_intervals.match.refinement import pixel_windows, pixels_of
@@ -18,6 +19,7 @@ from sat_intervals.match.statistics import Tally
 from sat_intervals.progress import Progress
 from sat_intervals.raster import BLOCK, RUN_FILES, codec_versions, compressed, factors, halved, read_views
 from sat_intervals.run.job import Job
+from sat_intervals.run.local_ranges import given_disparities
 from sat_intervals.run.state import files_of_run
 from sat_intervals.run.workers import Task, Workers, check_not_full, computing, picklable_errors, reason, results
 from sat_intervals.store.arrays import DamagedFileError
@@ -126,16 +128,18 @@ def finish_strip(job: Job, of: str, key: PartKey, scale: ConfidenceScale) -> str
         region, search, margin = job.store.grid.region, job.config.disparity, halo(job.config)
         first, last = key[1] * BLOCK, min(region.height, (key[1] + 1) * BLOCK)
         top, bottom = max(0, first - margin), min(region.height, last + margin)
-        shape, with_sigma = (last - first, region.width), job.config.products.sigma
-        intervals, validity = np.empty((4 + with_sigma, *shape), np.float32), np.empty((1, *shape), np.uint16)
+        shape, extra = (last - first, region.width), job.config.extra_bands
+        intervals, validity = np.empty((4 + len(extra), *shape), np.float32), np.empty((1, *shape), np.uint16)
+        given = given_disparities(job.config, Window(region.row + first, region.column, *shape))
         tally, row = Tally(search.count, search.minimum), 0
         try:
             pieces = raw_rows(job, job.config, top, bottom)
             for final in postprocess_strip(pieces, first - top, shape[0], scale, job.config):
                 rows = slice(row, row := row + len(final.validity))
-                intervals[:4, rows], validity[:, rows] = final[:4], final.validity
-                if with_sigma:
-                    intervals[4, rows] = final.sigma
+                if given is not None:
+                    final = with_agreement(final, given[rows])
+                bands = [*final[:4], *(getattr(final, name) for name in extra)]
+                intervals[:, rows], validity[:, rows] = bands, final.validity
                 tally.add(final)
         except DamagedTilesError as error:
             return str(error)

@@ -10,7 +10,7 @@ import json
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ import rasterio
 import xarray as xr
 from networks import trained_network
 
-from sat_intervals import load_config, match_arrays
+from sat_intervals import intervals_of, load_config, match_arrays
 from sat_intervals.config import Config
 from sat_intervals.config.weights import weights_file
 from sat_intervals.kernels.cost import Codes, between, census
@@ -46,7 +46,8 @@ PIPELINE = {
         "min_cost_paths": False,
         "penalty": {"penalty_method": "sgm_penalty", "p2_method": "constant", "P1": 8, "P2": 32},
     },
-    "cost_volume_confidence": {"confidence_method": "interval_bounds", "possibility_threshold": 0.9},
+    "cost_volume_confidence.bounds": {"confidence_method": "interval_bounds", "possibility_threshold": 0.9},
+    "cost_volume_confidence.ambiguity": {"confidence_method": "ambiguity", "normalization": False},
     "disparity": {"disparity_method": "wta", "invalid_disparity": "NaN"},
     "refinement": {"refinement_method": "vfit"},
 }
@@ -76,8 +77,9 @@ class Pair(NamedTuple):
 
 
 class Peer(NamedTuple):
-    """Pandora's results: costs ``(rows, columns, k)``, NaN = impossible, and bands ``(rows, columns)``."""
+    """Pandora's dataset of costs, NaN = impossible, which are ``(rows, columns, k)``; and bands ``(rows, columns)``."""
 
+    dataset: xr.Dataset
     volume: np.ndarray
     winner: np.ndarray
     lower: np.ndarray
@@ -113,25 +115,36 @@ def pair(request: pytest.FixtureRequest, shared_data: Path) -> Pair:
         return Pair(folder, no_data, left.read(1, masked=True), right.read(1, masked=True), config)
 
 
-@pytest.fixture(scope="module")
-def peer(pandora: ModuleType, pair: Pair) -> Peer:
+def run_pandora(pandora: ModuleType, pair: Pair, pipeline: dict[str, Any]) -> Peer:
     no_data = "NaN" if pair.no_data is None else pair.no_data
     left, right = ({"img": str(pair.folder / f"{side}.tif"), "nodata": no_data} for side in ("left", "right"))
     left["disp"] = [pair.config.disparity.minimum, pair.config.disparity.maximum]
     machine = pandora.state_machine.PandoraMachine()
-    settings = {"input": {"left": left, "right": right}, "pipeline": PIPELINE}
+    settings = {"input": {"left": left, "right": right}, "pipeline": pipeline}
     settings = pandora.check_configuration.check_conf(settings, machine)
     read = pandora.img_tools.create_dataset_from_inputs
     images = read(settings["input"]["left"]), read(settings["input"]["right"])
     refined, _ = pandora.run(machine, *images, settings)
     bounds = machine.left_cv["confidence_measure"]
     return Peer(
+        dataset=machine.left_cv,
         volume=machine.left_cv["cost_volume"].data,
         winner=machine.left_cv["disp_indices"].data,
-        lower=bounds.sel(indicator="confidence_from_interval_bounds_inf").data,
-        upper=bounds.sel(indicator="confidence_from_interval_bounds_sup").data,
+        lower=bounds.sel(indicator="confidence_from_interval_bounds_inf.bounds").data,
+        upper=bounds.sel(indicator="confidence_from_interval_bounds_sup.bounds").data,
         disparity=refined["disparity_map"].data,
     )
+
+
+@pytest.fixture(scope="module")
+def peer(pandora: ModuleType, pair: Pair) -> Peer:
+    return run_pandora(pandora, pair, PIPELINE)
+
+
+@pytest.fixture(scope="module")
+def peer_before(pandora: ModuleType, pair: Pair) -> Peer:
+    """Before libSGM."""
+    return run_pandora(pandora, pair, {name: step for name, step in PIPELINE.items() if name != "optimization"})
 
 
 @pytest.fixture(scope="module")
@@ -207,6 +220,41 @@ def test_match_arrays__disparities_equal_pandoras_but_for_rounding(peer: Peer, o
     tolerance = 2 * np.spacing(np.float32(64))
     difference = ours["disparity"].data[peer.whole] - peer.disparity[peer.whole]
     assert np.abs(difference).max() <= tolerance
+
+
+# ---- Pandora's volume --------------------------------------------------------------------------------------
+def test_intervals_of__equals_pandora_after_libsgm_but_for_ties(peer: Peer) -> None:
+    check_volume(peer, 448)
+
+
+def test_intervals_of__equals_pandora_before_libsgm_but_for_ties(peer_before: Peer) -> None:
+    check_volume(peer_before, 24)
+
+
+def check_volume(peer: Peer, span: int) -> None:
+    """Compare with Pandora on its volume, whose global range is the span, and quarters of it with the whole."""
+    assert (np.nanmin(peer.volume), np.nanmax(peer.volume)) == (0, span)
+    settings = SETTINGS | {"sgm": None, "ambiguity": {"normalization": "range"}}
+    del settings["cost"]
+    found, known = intervals_of(peer.dataset, span=span, config=settings), peer.possible.any(axis=2)
+    # At every pixel with a candidate. There are no ties: (1 - 0.9) * 448 = 44.8 and (1 - 0.9) * 24 = 2.4.
+    np.testing.assert_array_equal(found["lower"].data[known], peer.lower[known])
+    np.testing.assert_array_equal(found["upper"].data[known], peer.upper[known])
+    # A cost at exactly eta times the span above the lowest is ambiguous; Pandora's float32 loses some of them.
+    etas, count = 70, peer.volume.shape[2]
+    ours = np.rint((1 - found["confidence"].data) * etas * count)
+    peers = 1 - peer.dataset["confidence_measure"].sel(indicator="confidence_from_ambiguity.ambiguity").data
+    ties = [eta * span // 100 for eta in range(1, etas) if eta * span % 100 == 0]
+    excess = peer.volume - np.fmin.reduce(peer.volume, axis=2, keepdims=True)
+    lost = (ours - peers)[known]
+    assert (lost >= 0).all()
+    assert (lost <= np.isin(excess, ties).sum(axis=2)[known]).all()
+    # The declared span makes quarters of the volume give the same.
+    rows, columns = (size // 2 for size in known.shape)
+    for there in (slice(0, rows), slice(rows, None)):
+        for here in (slice(0, columns), slice(columns, None)):
+            quarter = intervals_of(peer.dataset.isel(row=there, col=here), span=span, config=settings)
+            xr.testing.assert_identical(quarter, found.isel(y=there, x=here))
 
 
 # ---- MC-CNN ------------------------------------------------------------------------------------------------

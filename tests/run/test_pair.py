@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import rasterio
 from helpers import LOCK, OUTPUTS, bands, calibration, hashes, shares_that_differ, write_pair
+from volumes import census_volume
 
 from sat_intervals import match_arrays, match_pair
 from sat_intervals.config import load_calibration, load_config
@@ -277,3 +278,62 @@ def test_match_block__of_another_version_is_refused(pair, tmp_path):
     other = replace(job, store=replace(job.store, run="another"))
     with pytest.raises(RunError, match="this worker has another version of sat-intervals"):
         match_block(other, next(iter(job.store.grid)))
+
+
+# ---- A matcher of one's own --------------------------------------------------------------------------------
+OWN = {"cost": {"method": "volume", "span": 8, "margin": 1}, "sgm": {"p1": 4, "p2": 24}}
+
+
+def test_match_pair__matches_volumes_of_a_function_as_our_own(pair, tmp_path):
+    left, right, settings = pair
+    expected = settings | {"cost": {"window": 3}, "sgm": {"p1": 4, "p2": 24}}
+    match_pair(left, right, tmp_path / "ours", expected)
+    match_pair(left, right, tmp_path / "one", in_tiles(settings | OWN, 512, "exact"), volume_of=census_volume)
+    report = match_pair(left, right, tmp_path / "own", in_tiles(settings | OWN, 64, "exact"), volume_of=census_volume)
+    np.testing.assert_array_equal(bands(tmp_path / "own")[0], bands(tmp_path / "ours")[0])
+    assert hashes(tmp_path / "own") == hashes(tmp_path / "one")
+    assert report["settings"]["cost"]["name"] == "volumes.census_volume"
+
+
+@pytest.mark.process
+def test_match_pair__takes_volumes_of_a_function_as_they_are_without_sgm(pair, tmp_path):
+    left, right, settings = pair
+    settings = settings | {"cost": OWN["cost"], "cluster": {"kind": "processes", "workers": 1}}
+    for size in (64, 512):
+        match_pair(left, right, tmp_path / str(size), in_tiles(settings, size, 2), volume_of=census_volume)
+    np.testing.assert_array_equal(*(bands(tmp_path / str(size))[0] for size in (64, 512)))
+
+
+def test_match_pair__resumes_only_with_the_same_function(pair, tmp_path):
+    left, right, settings = pair
+    settings = in_tiles(settings | OWN, 64, "exact")
+    calls = []
+
+    def fails(*arguments):
+        calls.append(arguments)
+        if len(calls) > 3:
+            raise ValueError("no more")
+        return census_volume(*arguments)
+
+    fails.__module__, fails.__qualname__ = census_volume.__module__, census_volume.__qualname__
+    with pytest.raises(RunError, match="no more"):
+        match_pair(left, right, tmp_path / "out", settings | {"cluster": {"workers": 1, "retries": 0}}, volume_of=fails)
+    with pytest.raises(SatIntervalsError, match=r"cost\.name was"):
+        match_pair(left, right, tmp_path / "out", settings, volume_of=np.zeros)
+    match_pair(left, right, tmp_path / "out", settings, volume_of=census_volume)
+    match_pair(left, right, tmp_path / "whole", settings, volume_of=census_volume)
+    assert hashes(tmp_path / "out") == hashes(tmp_path / "whole")
+
+
+def test_match_pair__refuses_a_function_that_does_not_fit(pair, tmp_path):
+    left, right, settings = pair
+    own = settings | OWN
+    for given, volume_of, message in (
+        (settings, census_volume, "volume_of is given, but cost.method is census"),
+        (own, None, "give match_pair volume_of"),
+        (own, lambda left, right, first: left, r"volume_of returned \(102, 152\) of float32, needed are \(100, 150, "),
+        (own, lambda *images: 100 * census_volume(*images), "values are outside 0 to 8"),
+        (own | {"disparity": {"local": True}}, census_volume, "leave out local ranges"),
+    ):
+        with pytest.raises(SatIntervalsError, match=message):
+            match_pair(left, right, tmp_path / "out", given, volume_of=volume_of)

@@ -1,0 +1,145 @@
+"""Measure intervals at the rungs of a ladder, rows by rows, against a truth; see `measurement`."""
+
+from collections.abc import Iterator
+from decimal import Decimal
+from typing import NamedTuple
+
+import numpy as np
+
+from sat_intervals.config import Calibration, Config, Interval, key_of
+from sat_intervals.config.calibration import COVERAGES
+from sat_intervals.match.measurement import FIELDS, HIGH, QUANTILES, SCHEMES, Ladders, Measured, measure
+from sat_intervals.match.postprocess import (
+    ConfidenceScale,
+    Filtered,
+    RawRows,
+    filter_rows,
+    regularized,
+    widened,
+)
+from sat_intervals.match.refinement import bounds_of_both
+from sat_intervals.products import INVALID
+
+# In place of a rung of levels: the cut that factors are of.
+OF_FITS = -1
+# A single pair is judged in blocks, this many along each side.
+_BLOCKS = 4
+
+
+def pairs_of(rungs: Ladders) -> list[tuple[int, int]]:
+    """Return the rungs of levels that are matched together; OF_FITS is the cut that factors are of."""
+    numbers = [*([] if rungs.are_one else [OF_FITS]), *range(rungs.low.size)]
+    return list(zip(numbers[::2], [*numbers[1::2], *numbers[-1:]], strict=False))
+
+
+def at_levels(config: Config, high: float, low: float, quantile: float | None) -> Config:
+    """Return settings whose intervals are cut at two levels, whatever the coverage, and without local ranges."""
+    rows = [{"coverage": coverage, "high": high, "low": low, "quantile": quantile} for coverage in COVERAGES]
+    constant = Calibration.model_validate({"name": "constant", "key": key_of(config), "levels": rows})
+    interval = Interval(coverage=Decimal(str(COVERAGES[0])), calibration=constant)
+    disparity = config.disparity.model_copy(update={"local": False, "grid": None, "around": None})
+    return config.model_copy(update={"interval": interval, "disparity": disparity})
+
+
+def block_numbers(row: int, height: int, shape: tuple[int, int]) -> np.ndarray:
+    """Return the number of the block of each pixel of some rows of a single pair of this shape."""
+    rows, columns = (np.arange(side) * _BLOCKS // side for side in shape)
+    return np.asarray(_BLOCKS * rows[row : row + height, None] + columns)
+
+
+class _Piece(NamedTuple):
+    """Rows with their halo, the range of those that are measured, and their truths and parts."""
+
+    rows: Filtered
+    first: int
+    last: int
+    truth: np.ndarray
+    parts: np.ndarray
+
+    @property
+    def inner(self) -> slice:
+        """Return the rows that are measured."""
+        return slice(self.first, self.last)
+
+    def of(self, name: str) -> np.ndarray:
+        """Return a band of the rows that are measured."""
+        return np.asarray(getattr(self.rows, name)[self.inner])
+
+    @property
+    def kept(self) -> np.ndarray:
+        """Return the mask of valid pixels."""
+        return np.asarray(self.of("validity") & INVALID == 0)
+
+
+class Gauge:
+    """Measures the intervals of a pair, as a whole, of a group, or in blocks, that of `block_numbers`."""
+
+    def __init__(self, rungs: Ladders, group: str, tolerance: float, *, in_blocks: bool) -> None:
+        parts = _BLOCKS**2 if in_blocks else 1
+        self._names = [f"block {part}" for part in range(parts)] if in_blocks else [group]
+        self._rungs, self._tolerance = rungs, tolerance
+        self._tables = np.zeros((parts, rungs.low.size, SCHEMES, FIELDS))
+        self._known, self._good = np.zeros((2, parts))
+
+    def measured(self) -> list[Measured]:
+        """Return the measurement of each part."""
+        parts = [
+            Measured(name, 1.0, table, int(known), int(good))
+            for name, table, known, good in zip(self._names, self._tables, self._known, self._good, strict=True)
+        ]
+        kept = sum(part.kept for part in parts)
+        return [part._replace(weight=1 / max(kept, 1)) for part in parts]
+
+    def add(
+        self,
+        strip: RawRows,
+        inner: slice,
+        scale: ConfidenceScale,
+        truth: tuple[np.ndarray, np.ndarray],
+        pair: tuple[int, int],
+        config: Config,
+    ) -> None:
+        """Measure the rows ``inner`` of some rows with their halo, whose cuts are a pair of rungs, see `pairs_of`.
+
+        ``truth``: of these rows, and the number of the part of each pixel.
+        """
+        for rung, names in zip(dict.fromkeys(pair), (("lower", "upper"), ("lower_low", "upper_low")), strict=False):
+            lower, upper = (getattr(strip, name) for name in names)
+            rows = filter_rows(
+                strip._replace(lower=lower, upper=upper, lower_low=lower, upper_low=upper), scale, config
+            )
+            piece = _Piece(rows, inner.start, inner.stop, *truth)
+            if rung == (0 if self._rungs.are_one else OF_FITS):
+                self._count(piece)
+            for number, scheme, bounds in self._bounds(piece, rung, config):
+                self._tables[:, number, scheme] += self._measured(piece, scheme, bounds, config)
+
+    def _bounds(
+        self, piece: _Piece, rung: int, config: Config
+    ) -> Iterator[tuple[int, int, tuple[np.ndarray, np.ndarray]]]:
+        """Yield the rungs and schemes that a piece is measured for, and their bounds."""
+        if rung == OF_FITS:
+            fits, lower, upper = piece.rows.fits(piece.inner), piece.of("lower"), piece.of("upper")
+            for number, factor in enumerate(self._rungs.high):
+                yield number, HIGH, bounds_of_both(fits, lower, upper, factor, config)
+            return
+        for scheme, quantile in enumerate((None, *QUANTILES)):
+            if scheme != HIGH or self._rungs.are_one:
+                yield rung, scheme, regularized(piece.rows, piece.first, piece.last, config, quantile)
+
+    def _count(self, piece: _Piece) -> None:
+        """Count pixels with truth, and good ones."""
+        near = piece.kept & (abs(piece.of("disparity") - piece.truth) <= 1)
+        for counts, chosen in ((self._known, np.isfinite(piece.truth)), (self._good, near)):
+            counts += np.bincount(piece.parts[chosen], minlength=counts.size)
+
+    def _measured(
+        self, piece: _Piece, scheme: int, bounds: tuple[np.ndarray, np.ndarray], config: Config
+    ) -> np.ndarray:
+        """Measure the bounds of the kept pixels of a scheme's class."""
+        chosen = np.flatnonzero(piece.kept & np.isfinite(piece.truth) & (piece.of("low") == (scheme != HIGH)))
+        middle, lower, upper, true, part = (
+            band.ravel()[chosen] for band in (piece.of("disparity"), *bounds, piece.truth, piece.parts)
+        )
+        lower, upper = widened(lower, upper, middle, config)
+        return measure(lower, upper, true, self._tolerance, part, len(self._tables))
