@@ -1,9 +1,9 @@
 """Errors of the package, and the check that a path is a file."""
 
+import os
+
 REPORT = "sat_intervals.report"
 """Name of the logger of the warnings of a run, which commands print below their table."""
-
-import os
 
 
 class SatIntervalsError(ValueError):
