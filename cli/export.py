@@ -23,11 +23,11 @@ def export(out: Path, target: Path, form: str, overwrite: bool) -> None:
     otb    disparity.tif (horizontal, vertical), mask.tif (255 = valid)
     asp    experimental: TARGET-F.tif (horizontal, vertical, valid);
            TARGET is a prefix
-    s2p    experimental: rectified_disp.tif,
-           rectified_mask.png (1 = valid), rectified_disp_confidence.tif
+    s2p    rectified_disp.tif, rectified_mask.png (1 = valid),
+           rectified_disp_confidence.tif
 
-    Experimental formats follow the documentation of the tool. They have not been tested with the tool itself. All files
-    have the size of the left image.
+    The format of ASP follows its documentation and has not been tested with ASP itself. All files have the size of the
+    left image.
     """  # noqa: D301 (\b keeps the line breaks in click)
     from sat_intervals.interop.export import export
 

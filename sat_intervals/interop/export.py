@@ -57,7 +57,7 @@ FORMATS = {
     "otb": (Raster("disparity.tif", ("horizontal", "vertical")), Raster("mask.tif", ("valid",), valid=255)),
     # parallel_stereo --entry-point 5, not run with it
     "asp": (Raster("-F.tif", ("horizontal", "vertical", "valid")),),
-    # after matching a tile, not run with it
+    # after matching a tile
     "s2p": (
         Raster("rectified_disp.tif", ("disparity",), nan),
         Raster("rectified_mask.png", ("valid",), valid=1),
