@@ -123,6 +123,8 @@ class Console:
         width = counts["median_interval_width"]
         table.add_row("median interval width", "none" if width is None else f"{width:.2f} px")
         table.add_row("low confidence, of valid pixels", _share(counts["low_confidence"], counts["valid"]))
+        if any((given := counts["agreement"]).values()):
+            table.add_row("given disparities inside", _share(given["inside"], sum(given.values())))
         if report.get("rows"):
             of_rows = report["survey"]["rows"]
             moved = f"up to {of_rows['most']:.2f} px, {of_rows['after'][0]:.2f} px left"

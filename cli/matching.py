@@ -271,6 +271,8 @@ def _with_search(
         ends = {"disparity.minimum": disparity[0], "disparity.maximum": disparity[1]}
         _put(settings.sections, "--disparity", **ends)
     _put(settings.sections, "--local-range", **{"disparity.local": local_range or None})
+    if margin is not None and around is None and settings.file is None:
+        raise click.UsageError("--margin is for --around: give both.")
     _put(settings.sections, "--around", **{"disparity.around": around})
     _put(settings.sections, "--margin", **{"disparity.margin": margin})
     return settings

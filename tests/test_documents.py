@@ -19,7 +19,7 @@ from sat_intervals.raster import read_layers
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [ROOT / "README.md", ROOT / "METHOD.md", *sorted((ROOT / "docs").glob("*.md"))]
-MOST_WORDS, MOST_WORDS_OF_A_SENTENCE = 1800, 30
+MOST_WORDS, MOST_WORDS_OF_A_SENTENCE = 1500, 30
 
 
 def prose(text: str) -> str:

@@ -19,7 +19,10 @@ from sat_intervals.products import IMPOSSIBLE_COST
 
 # Coverages of a calibration; others are interpolated.
 COVERAGES = (0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 0.975, 0.99)
-MAKE_ONE = "make one with sat-intervals calibrate (--calibration), or give interval.alpha 0.9 (--alpha 0.9)"
+MAKE_ONE = (
+    "make one with sat-intervals calibrate (--calibration), of volumes with calibrate_volumes, or give "
+    "interval.alpha 0.9 (--alpha 0.9)"
+)
 # Keys of settings that no calibration has.
 SETTINGS = {"preset", "disparity", "cost", "sgm", "interval"}
 

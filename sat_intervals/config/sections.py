@@ -183,7 +183,7 @@ class Volume(Section):
     span: Exact = Field(Decimal(1), gt=0, description="largest possible value minus the smallest; 1 for probabilities")
     lowest: Exact = Field(Decimal(0), description="smallest possible value")
     margin: int = Field(0, ge=0, le=1024, description="pixels that volume_of needs around a tile")
-    name: str | None = Field(None, description="of the function volume_of; set by match_pair")
+    name: str | None = Field(None, description="of volume_of and its version; by default that of the function")
 
     precomputed: ClassVar = 2  # bytes of a cost
     needs_statistics: ClassVar = False

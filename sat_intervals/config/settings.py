@@ -301,11 +301,11 @@ class Config(Section):
 
 
 def _sgm_of_volume(cost: Mapping[str, Any], sgm: Any) -> Any:
-    """Return the section ``sgm`` of a foreign volume: none by default; true: the preset's penalties by its span."""
-    if sgm is True:
+    """Return the section ``sgm`` of a foreign volume: none by default; penalties follow from its span."""
+    if sgm is True or (sgm and isinstance(sgm, Mapping)):
         with suppress(ArithmeticError, ValueError):  # the section names a span that is no number
             span = Decimal(str(cost.get("span", 1)))
-            return {"p1": float(span / 2), "p2": float(3 * span)}
+            return {"p1": float(span / 2), "p2": float(3 * span), **({} if sgm is True else sgm)}
     return sgm or None
 
 

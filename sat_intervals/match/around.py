@@ -5,12 +5,15 @@ from collections.abc import Iterable
 import numpy as np
 
 from sat_intervals.config import Config
+from sat_intervals.config.sections import MOST_PIXELS
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.products import Bands
 
 # Side in pixels of the cells that share a range.
 CELL = 64
+# Disparities of a range that no pair of images has.
+_WIDEST = 8000
 
 
 def ranges_around(rows: Iterable[np.ndarray], margin: int) -> LocalRanges:
@@ -25,7 +28,7 @@ def ranges_around(rows: Iterable[np.ndarray], margin: int) -> LocalRanges:
         most = np.maximum.reduceat(np.where(known, given, -np.inf).max(axis=0), starts)
         has_some = np.logical_or.reduceat(known.any(axis=0), starts)
         ends = np.where(has_some, [np.floor(least - margin), np.ceil(most + margin)], [[1], [0]])
-        found.append(np.clip(ends, -16000, 16000).astype(np.int16))
+        found.append(np.clip(ends, -MOST_PIXELS, MOST_PIXELS).astype(np.int16))
     minimum, maximum = np.stack(found, axis=1)
     return LocalRanges(minimum, maximum, CELL, CELL)
 
@@ -35,7 +38,13 @@ def with_hull(config: Config, ranges: LocalRanges, source: str) -> Config:
     known = ranges.minimum <= ranges.maximum
     if not known.any():
         raise SatIntervalsError(f"{source} has no data: give another raster, or the search range")
-    ends = {"minimum": int(ranges.minimum[known].min()), "maximum": int(ranges.maximum[known].max())}
+    least, most = int(ranges.minimum[known].min()), int(ranges.maximum[known].max())
+    if most - least > _WIDEST:
+        raise SatIntervalsError(
+            f"{source} has disparities of {least} to {most} px with the margin: declare its no-data value, or give "
+            "the search range"
+        )
+    ends = {"minimum": least, "maximum": most}
     return config.model_copy(update={"disparity": config.disparity.model_copy(update=ends)})
 
 

@@ -4,16 +4,18 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
 from sat_intervals.config import Calibration, Config, ConfigError, key_of
 from sat_intervals.match.calibration import calibration_of_parts
-from sat_intervals.match.foreign import open_foreign
+from sat_intervals.match.foreign import open_foreign, unmasked
 from sat_intervals.match.gauge import Gauge, at_levels, block_numbers, pairs_of
 from sat_intervals.match.measurement import Measured, ladders
 from sat_intervals.match.volumes import Kind, Values, cost_of, flags_of, matched_volume, volume_config
 from sat_intervals.match.whole import scale_of_rows
 
 _FEWEST = 1000  # pixels with truth, of all volumes
+_AMONG = 0.5  # of the truths of a volume that must be among its candidates
 
 
 def calibrate_volumes(
@@ -55,18 +57,25 @@ def calibrate_volumes(
         A volume or its truth cannot be used; fewer than 1000 pixels have a truth.
     """
     parts: list[Measured] = []
-    described = []
+    described, pairs = [], list(pairs)
     for number, (volume, truth) in enumerate(pairs):
         foreign = open_foreign(volume, disparities, kind, span)
         settings = volume_config(foreign, config)
         if missing := [step for step in ("ambiguity", "regularization") if getattr(settings, step) is None]:
             raise ConfigError(f"{' and '.join(missing)} is null, but a calibration needs confidence: leave it on")
-        true = np.asarray(truth, np.float64)
+        true = unmasked(truth.data if isinstance(truth, xr.DataArray) else truth).astype(np.float64)
         if true.shape != foreign.shape[:2]:
             raise ConfigError(f"truth {number} is {true.shape}, its volume {foreign.shape[:2]}: give one a pixel")
         rungs, flags = ladders(settings), flags_of(None, foreign.shape)
         gauge = Gauge(rungs, f"volume {number}", tolerance / foreign.step, in_blocks=len(pairs) == 1)
         blocks = block_numbers(0, len(true), true.shape) if len(pairs) == 1 else np.zeros(true.shape, np.int64)
+        known = true[np.isfinite(true)]
+        among = np.mean((known >= foreign.disparities[0]) & (known <= foreign.disparities[-1])) if known.size else 1.0
+        if among < _AMONG:
+            raise ConfigError(
+                f"{100 * among:.0f} % of the disparities of truth {number} are among the candidates: check their sign, "
+                "x_right = x_left + disparity"
+            )
         true = (true - foreign.first) / foreign.step + settings.disparity.minimum
         cost = cost_of(foreign, flags, settings)
         for pair in pairs_of(rungs):

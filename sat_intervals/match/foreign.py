@@ -51,8 +51,8 @@ class Foreign:
 
     @property
     def first_index(self) -> int:
-        """Return the first disparity in steps, as the kernels count them; 0 if it is no whole number of them."""
-        first = self.first / self.step
+        """Return the first disparity as the kernels count candidates; 0 if they are no whole pixels."""
+        first = self.first / self.step if self.step == 1 else 0.5  # a search range is in pixels
         return round(first) if abs(first - round(first)) < _TOLERANCE else 0
 
     @property
@@ -67,7 +67,7 @@ class Foreign:
         """Return the section ``cost`` of the settings."""
         if self.kind == "probability":
             return {"method": "volume", "kind": self.kind}
-        span = round(self.highest - self.lowest, 9)
+        span = float(f"{self.highest - self.lowest:.9g}")
         return {"method": "volume", "kind": self.kind, "span": span, "lowest": self.lowest}
 
 
@@ -88,9 +88,7 @@ def open_foreign(volume: Any, disparities: Any, kind: str | None, span: Any) -> 
         values = volume.data
     else:
         values, coordinates = np.asanyarray(volume), {}
-    if isinstance(values, np.ma.MaskedArray):
-        values = values.filled(np.nan)
-    values = np.asarray(values)
+    values = unmasked(values)
     if values.ndim != 3 or values.dtype.kind not in "uif" or 0 in values.shape:
         raise ConfigError(f"the volume is {values.shape} of {values.dtype}: give rows, columns, disparities of numbers")
     kind = kind or {"min": "cost", "max": "similarity"}.get(attributes.get("type_measure", ""))
@@ -99,6 +97,13 @@ def open_foreign(volume: Any, disparities: Any, kind: str | None, span: Any) -> 
     labels = xr.DataArray(np.empty(values.shape[:2], np.bool_), coordinates, ("y", "x"))
     ends = _ends(kind, span, attributes.get("cmax"))
     return Foreign(values, _spaced(disparities, values.shape[2]), labels, kind, *ends)
+
+
+def unmasked(values: Any) -> np.ndarray:
+    """Return an array, with NaN under a mask."""
+    if isinstance(values, np.ma.MaskedArray):
+        return np.ma.filled(values.astype(np.result_type(values, np.float32)), np.nan)
+    return np.asarray(values)
 
 
 def _in_order(volume: xr.DataArray) -> tuple[xr.DataArray, Hashable]:
@@ -117,7 +122,10 @@ def _spaced(disparities: Sequence[float] | None, count: int) -> np.ndarray:
     """Return the disparities of the candidates; raise unless they are as many, and evenly spaced."""
     if disparities is None:
         raise ConfigError("disparities are missing: give those of the candidates, in pixels")
-    found = np.asarray(disparities, np.float64)
+    found = np.asarray(disparities)
+    if found.dtype.kind not in "uif":
+        raise ConfigError(f"disparities are {found.dtype}: give numbers, in pixels")
+    found = found.astype(np.float64)
     if found.shape != (count,):
         raise ConfigError(f"{found.size} disparities are given, but the volume has {count} candidates")
     if count < _FEWEST:
@@ -136,6 +144,8 @@ def _ends(kind: str, span: Any, largest: float | None) -> tuple[float, float]:
         return 0.0, 1.0
     if span is None:
         raise ConfigError("span is missing: give the largest possible value minus the smallest")
+    if np.size(span) > 2:
+        raise ConfigError(f"span is {span}: give a number, or the smallest and the largest possible value")
     low, high = (0.0, float(span)) if np.ndim(span) == 0 else map(float, span)
     if kind == "similarity" and largest is not None and np.ndim(span) == 0:
         low, high = float(largest) - high, float(largest)

@@ -13,6 +13,7 @@ from sat_intervals.kernels.correlation import correlate
 from sat_intervals.kernels.cost import Cells, Codes, Costs, between, census, padded_to_lanes, window_state
 from sat_intervals.kernels.penalties import Gradients, Rule
 from sat_intervals.match.costs import MatchingCost, foreign_costs, integer_costs
+from sat_intervals.match.foreign import unmasked
 from sat_intervals.match.mccnn import RADIUS, Network, load_network
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
 from sat_intervals.tiling import View, Views, Window, facing, hull
@@ -84,7 +85,8 @@ def cost_areas(
     """
     if isinstance(config.cost, Volume):
         if made is None:
-            assert network is not None  # a job always comes with it
+            if network is None:
+                raise SatIntervalsError("cost.method is volume: use intervals_of, or match_pair with volume_of")
             assert not isinstance(network, Network)
             made = [_values(views, area, config, network) for area in areas]
         return [foreign_costs(of_area, area.disparities, config) for area, of_area in zip(areas, made, strict=True)]
@@ -118,7 +120,7 @@ def _values(views: Views, area: Area, config: Config, volume_of: VolumeOf) -> np
         np.ma.array(view.inner(view.pixels, there), mask=view.inner(view.state, there) != 0)
         for view, there in zip(views, (area.base.grown(margin, margin), area.facing.grown(margin, margin)), strict=True)
     )
-    values = np.asarray(volume_of(left, right, area.minimum))
+    values = unmasked(volume_of(left, right, area.minimum))
     needed = (area.base.height, area.base.width, area.disparities)
     if values.shape != needed or values.dtype.kind not in "uif":
         raise SatIntervalsError(f"volume_of returned {values.shape} of {values.dtype}, needed are {needed} numbers")

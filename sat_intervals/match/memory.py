@@ -2,7 +2,7 @@
 
 from math import isqrt
 
-from sat_intervals.config import Config, ConfigError, Mccnn
+from sat_intervals.config import Config, ConfigError, Mccnn, Volume
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.machine import usable_memory
@@ -53,7 +53,13 @@ def tile_bytes(config: Config, size: int | None = None) -> int:
     if accurate:
         volume = 2 * size * (size + config.disparity.count) * lanes  # the volume of the right view is wider
     if config.cost.precomputed:
-        volume += config.cost.precomputed * lanes * patch * (patch + accurate * (patch + config.disparity.count))
+        of_values = 4 if isinstance(config.cost, Volume) else 0  # those that are converted
+        volume += (
+            (config.cost.precomputed + of_values)
+            * lanes
+            * patch
+            * (patch + accurate * (patch + config.disparity.count))
+        )
     if isinstance(config.cost, Mccnn):
         volume += _NETWORK_BYTES * (patch + config.disparity.count)
     paths = 2 * 3 * (patch + config.disparity.count) * lanes

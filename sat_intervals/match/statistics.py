@@ -20,6 +20,7 @@ class Tally:
         self._ends = np.zeros(2, np.int64)
         # Histogram of the sums of flags, from which all counts follow.
         self._sums = np.zeros(1 << (max(flag.bit for flag in FLAGS) + 1), np.int64)
+        self._agreement = np.zeros(2, np.int64)
         self._widths = np.zeros(round(count / _WIDTH_STEP) + 1, np.int64)
         self._whole = round((count - 1) / _WIDTH_STEP)
 
@@ -30,6 +31,7 @@ class Tally:
         at_end = bands.validity & (RANGE_END | RANGE_INCOMPLETE) == RANGE_END
         ends = bands.disparity[bands.valid & at_end]
         self._ends += np.count_nonzero(ends < self._middle), np.count_nonzero(ends >= self._middle)
+        self._agreement += np.count_nonzero(bands.agreement == 0), np.count_nonzero(bands.agreement == 1)
         width = (bands.upper - bands.lower)[bands.valid]
         width = np.rint(width[np.isfinite(width)] / np.float32(_WIDTH_STEP)).astype(np.int32)
         self._widths += np.bincount(width, minlength=self._widths.size)
@@ -38,7 +40,12 @@ class Tally:
         """Return all counts, each with its place; `merge` adds them."""
         return {
             name: [[int(place), int(counts[place])] for place in np.flatnonzero(counts)]
-            for name, counts in (("ends", self._ends), ("sums", self._sums), ("widths", self._widths))
+            for name, counts in (
+                ("ends", self._ends),
+                ("agreement", self._agreement),
+                ("sums", self._sums),
+                ("widths", self._widths),
+            )
         }
 
     def merge(self, counts: Mapping[str, Sequence[Sequence[int]]]) -> None:
@@ -56,7 +63,8 @@ class Tally:
 
         ``ambiguous``: valid, with the whole search range as interval. ``range_ends``: valid, with the flag range_end
         and without range_incomplete, by the end. ``flags`` counts a pixel under each of its flags, ``causes`` each
-        invalid pixel once, see `products.cause`: with ``valid`` they sum to ``pixels``.
+        invalid pixel once, see `products.cause`: with ``valid`` they sum to ``pixels``. ``agreement``: pixels whose
+        given disparity is outside or inside the interval.
         """
         upto = np.cumsum(self._widths)
         median = float(np.searchsorted(upto, upto[-1] / 2) * _WIDTH_STEP) if upto[-1] else None
@@ -71,5 +79,6 @@ class Tally:
             "flags": {flag.name: self._count(sums & flag.value != 0) for flag in FLAGS},
             "causes": {flag.name: self._count(causes == flag.value) for flag in FLAGS if flag.invalid},
             "range_ends": {"minimum": int(self._ends[0]), "maximum": int(self._ends[1])},
+            "agreement": {"outside": int(self._agreement[0]), "inside": int(self._agreement[1])},
             "median_interval_width": None if median is None else round(median, 2),
         }

@@ -76,14 +76,20 @@ def intervals_of(
         The volume cannot be used, or the settings do not fit it.
     """
     foreign = open_foreign(volume, disparities, kind, span)
-    settings = resolved(volume_config(foreign, config))
+    settings = volume_config(foreign, config)
+    if settings.interval and settings.has_coverage and settings.interval.calibration is None:
+        raise ConfigError(
+            "interval.coverage needs a calibration of volumes of this matcher: make one with calibrate_volumes, or "
+            "give interval.alpha"
+        )
+    settings = resolved(settings)
     flags = flags_of(valid, foreign.shape)
     rows, settings = matched_volume(foreign, cost_of(foreign, flags, settings), flags, right, settings)
     return labelled(_in_pixels(finish_whole(rows, settings), foreign, settings), foreign.labels, {})
 
 
 def volume_config(foreign: Foreign, config: Config | Mapping[str, Any] | None) -> Config:
-    """Return settings for a volume; raise if they ask for a coverage without its calibration."""
+    """Return settings for a volume."""
     given: Any = config if isinstance(config, Config) else {"preset": "paper", **(config or {})}
     sgm = {"sgm": given["sgm"]} if isinstance(config, Mapping) and "sgm" in config else {}
     first = foreign.first_index
@@ -91,11 +97,6 @@ def volume_config(foreign: Foreign, config: Config | Mapping[str, Any] | None) -
     found = load_config(given, {"cost": foreign.cost, "disparity": search, **sgm})  # not the penalties of another cost
     if found.fits:
         found = load_config(found, {"refinement": {"method": "vfit"}, "products": {"sigma": False}})
-    if found.interval and found.has_coverage and found.interval.calibration is None:
-        raise ConfigError(
-            "interval.coverage needs a calibration of volumes of this matcher: make one with calibrate_volumes, or "
-            "give interval.alpha"
-        )
     return found
 
 
@@ -121,7 +122,9 @@ def matched_volume(
         raise ConfigError("the volume has no finite value at any valid pixel")
     np.copyto(raw.validity, flags, where=flags != 0)
     if checks and not is_plain:
-        minimum, winners = _of_right(foreign, right, config) if right is not None else _of_diagonals(foreign, config)
+        minimum, winners = (
+            _of_right(foreign, right, config) if right is not None else _of_diagonals(foreign, flags, config)
+        )
         found = foreign.first + foreign.step * (raw.winner.astype(np.float64) - config.disparity.minimum)
         last = minimum + winners.shape[1] - columns
         whole = np.clip(np.floor(found + 0.5), minimum, last).astype(np.int16)
@@ -135,8 +138,11 @@ def flags_of(valid: Any, shape: tuple[int, ...]) -> np.ndarray:
     if valid is None:
         return np.zeros(shape[:2], np.uint16)
     given = np.asarray(valid)
-    if given.shape != shape[:2] or given.dtype.kind not in "bui":
-        raise ConfigError(f"valid is {given.shape} of {given.dtype}: give {shape[:2]} of bool, or of validity flags")
+    if given.shape != shape[:2] or given.dtype not in (np.bool_, np.uint16):
+        raise ConfigError(
+            f"valid is {given.shape} of {given.dtype}: give {shape[:2]} of bool, such as mask != 0, or of "
+            "validity flags (uint16)"
+        )
     if given.dtype == np.bool_:
         return np.where(given, 0, LEFT_MASKED).astype(np.uint16)
     return (given & (INVALID & ~REJECTED)).astype(np.uint16)
@@ -146,7 +152,10 @@ def _of_right(foreign: Foreign, right: Values, config: Config) -> tuple[int, np.
     """Return the winners of another volume, in the layout of `cross_check`, and the first disparity of that layout."""
     labelled_alone = isinstance(right, xr.Dataset | xr.DataArray)
     there = open_foreign(
-        right, None if labelled_alone else -foreign.disparities[::-1], foreign.kind, (foreign.lowest, foreign.highest)
+        right,
+        None if labelled_alone else -foreign.disparities[::-1],
+        foreign.kind,
+        None if foreign.kind == "probability" else (foreign.lowest, foreign.highest),
     )
     if there.shape[0] != foreign.shape[0]:
         raise ConfigError(f"the right volume has {there.shape[0]} rows, the left one {foreign.shape[0]}")
@@ -157,12 +166,13 @@ def _of_right(foreign: Foreign, right: Values, config: Config) -> tuple[int, np.
     back[raw.winner == NO_DISPARITY] = NO_DISPARITY
     first, last = int(np.floor(foreign.disparities[0])), int(np.ceil(foreign.disparities[-1]))
     winners = np.full((foreign.shape[0], foreign.shape[1] + last - first), NO_DISPARITY, np.int16)
-    start, stop = max(0, first), min(there.shape[1], first + winners.shape[1])
+    start = max(0, first)
+    stop = max(start, min(there.shape[1], first + winners.shape[1]))
     winners[:, start - first : stop - first] = back[:, start:stop]
     return first, winners
 
 
-def _of_diagonals(foreign: Foreign, config: Config) -> tuple[int, np.ndarray]:
+def _of_diagonals(foreign: Foreign, flags: np.ndarray, config: Config) -> tuple[int, np.ndarray]:
     """Return the same along the diagonals of the volume, among the candidates at whole pixels."""
     every, start = foreign.whole_pixels
     if every == 0 or config.sgm:
@@ -174,7 +184,8 @@ def _of_diagonals(foreign: Foreign, config: Config) -> tuple[int, np.ndarray]:
     found = []
     for window in strips(*foreign.shape[:2], _PIXELS):
         values = foreign.values[window.row : window.row_stop, :, start::every]
-        costs = integer_costs(values, config, compares_pixels=True)[:, :, : values.shape[2]]
+        blocked = flags[window.row : window.row_stop] != 0
+        costs = integer_costs(values, config, blocked, compares_pixels=True)[:, :, : values.shape[2]]
         costs[costs == config.impossible_cost] = IMPOSSIBLE_COST
         found.append(read_right_winners(costs, minimum))
     return minimum, np.concatenate(found)

@@ -108,7 +108,16 @@ def _named(config: Config, volume_of: VolumeOf | None) -> Config:
         if volume_of is not None:
             raise ConfigError(f"volume_of is given, but cost.method is {config.cost.method}: give cost.method volume")
         return config
-    name = volume_of and f"{volume_of.__module__}.{getattr(volume_of, '__qualname__', type(volume_of).__qualname__)}"
+    if volume_of is not None and not callable(volume_of):
+        raise ConfigError(f"volume_of is {volume_of!r}: give the function that makes the volume of a tile")
+    if volume_of is None:
+        return config
+    named = getattr(volume_of, "__qualname__", "<")  # neither an object nor what it holds has a name
+    name = config.cost.name or f"{volume_of.__module__}.{named}"
+    if "<" in name:
+        raise ConfigError(
+            f"volume_of is {volume_of!r}: name it and its version in cost.name, by which a run knows what to resume"
+        )
     return config.model_copy(update={"cost": config.cost.model_copy(update={"name": name})})
 
 

@@ -97,6 +97,11 @@ def warnings_of(job: Job, counts: Mapping[str, Any], quality: Mapping[str, Any])
     rows = rows_left(job.survey, config.rows, job.right.path)
     was_found = job.found is not None
     of_range = _doubts_of_range(counts, config.disparity, paths[0], was_found=was_found)
+    if (of_given := counts["agreement"])["outside"] > of_given["inside"]:
+        of_data.append(
+            f"{config.disparity.around}: {of_given['outside']} of {sum(of_given.values())} disparities are outside the "
+            "intervals: check that x_right = x_left + disparity, and that it is of the left image"
+        )
     if of_data or (found and found.contradiction):
         of_pair = rows
     else:  # where a given range is wrong, rows are, too

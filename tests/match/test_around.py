@@ -123,3 +123,21 @@ def test_around__is_refused_in_one_line(scene, given, settings, tmp_path) -> Non
         intervals_around(scene.left, scene.right, given[:-1], settings)
     with pytest.raises(SatIntervalsError, match="around gives local ranges of its own"):
         match_pair(*images, tmp_path / "out", {"disparity": {"local": True, "around": "given.tif"}})
+
+
+def test_match__around_says_how_many_disparities_are_inside(scene, given, tmp_path) -> None:
+    write_pair(tmp_path, scene)
+    write_layer(tmp_path / "given.tif", given, np.nan, PLACE)
+    write_layer(tmp_path / "negative.tif", -given, np.nan, PLACE)
+    images = tmp_path / "left.tif", tmp_path / "right.tif"
+    right = invoke("match", *images, tmp_path / "right", "--around", tmp_path / "given.tif", "--preset", "paper")
+    counts = json.loads((tmp_path / "right" / "run.json").read_text())["counts"]["agreement"]
+    share = 100 * counts["inside"] / sum(counts.values())
+    assert 80 < share < 95
+    assert "given disparities inside" in right.stdout
+    assert f"{share:.1f} %" in right.stdout
+    assert right.stderr == ""
+    wrong = invoke("match", *images, tmp_path / "wrong", "--around", tmp_path / "negative.tif", "--disparity", -30, 30)
+    assert "disparities are outside the intervals: check that x_right = x_left + disparity" in wrong.stderr
+    refused = invoke("match", *images, tmp_path / "no", "--margin", 4)
+    assert (refused.exit_code, "--margin is for --around: give both" in refused.stderr) == (2, True)

@@ -49,9 +49,21 @@ def test_calibrate_volumes__reaches_a_coverage_on_other_scenes(scenes, tmp_path)
 
 def test_calibrate_volumes__judges_a_single_volume_in_blocks(scenes) -> None:
     volume, truth = scenes[0]
-    half = calibrate_volumes([(volume[:, :, 8:], truth)], DISPARITIES[8:] / 2, kind="similarity", span=1, tolerance=0.5)
-    assert half.provenance["pairs"] == [{"name": "volume 0", "search_range": [-4, 16], "tolerance": 0.5}]
-    assert half.provenance["expected"][0]["lowest"] is not None
+    how = {"kind": "similarity", "span": 1, "config": {"cross_check": None}}
+    half = calibrate_volumes([(volume[:, :, 8:], truth / 2)], DISPARITIES[8:] / 2, tolerance=0.25, **how)
+    whole = calibrate_volumes([(volume[:, :, 8:], truth)], DISPARITIES[8:], tolerance=0.5, **how)
+    assert half.provenance["pairs"] == [{"name": "volume 0", "search_range": [-4, 16], "tolerance": 0.25}]
+    assert half.levels == whole.levels
+    assert half.provenance["expected"][0]["lowest"] == whole.provenance["expected"][0]["lowest"]
+
+
+def test_calibrate_volumes__takes_a_mask_of_the_truth(scenes) -> None:
+    volume, truth = scenes[0]
+    unknown = np.indices(truth.shape)[1] < 90
+    masked = np.ma.array(np.where(unknown, -9999.0, truth), mask=unknown)
+    how = {"disparities": DISPARITIES, "kind": "probability", "config": {"interval": {"coverage": 0.9}}}
+    expected = calibrate_volumes([(volume, np.where(unknown, np.nan, truth))], **how)
+    assert calibrate_volumes(iter([(volume, masked)]), **how).levels == expected.levels
 
 
 def test_calibrate_volumes__refuses_in_one_line(scenes) -> None:
@@ -59,6 +71,7 @@ def test_calibrate_volumes__refuses_in_one_line(scenes) -> None:
     refused = {
         r"truth 0 is \(9, 200\), its volume \(150, 200\)": {"pairs": [(volume, truth[:9])]},
         "0 kept pixels have a truth, at least 1000": {"pairs": [(volume, np.full_like(truth, np.nan))]},
+        "0 % of the disparities of truth 0 are among": {"pairs": [(volume, truth + 200)]},
         "regularization is null": {"pairs": [(volume, truth)], "config": {"regularization": None}},
     }
     for message, given in refused.items():

@@ -162,6 +162,35 @@ def test_intervals_of__cross_checks_against_a_right_volume(volume):
     assert np.isfinite(wrong["disparity"]).mean() < 0.7 * np.isfinite(alone["disparity"]).mean()
 
 
+def test_intervals_of__cross_checks_probabilities_against_a_right_volume(volume):
+    probability = softmax(np.where(np.isfinite(volume), volume, np.inf), 2)
+    right = np.full((volume.shape[0], volume.shape[1], DISPARITIES.size), np.nan)
+    for index, disparity in enumerate(-DISPARITIES[::-1]):  # the right pixel at column x sees the left one at x + it
+        columns = np.arange(volume.shape[1])
+        inside = (columns + disparity >= 0) & (columns + disparity < volume.shape[1])
+        right[:, inside, index] = probability[:, columns[inside] + disparity, DISPARITIES.size - 1 - index]
+    total = np.nansum(right, axis=2, keepdims=True)
+    right /= np.where(total > 0, total, 1)
+    how = {"kind": "probability", "disparities": DISPARITIES}
+    found, alone = intervals_of(probability, right=right, **how), intervals_of(probability, **how)
+    rejected = [(one["validity"].data & (OCCLUSION | MISMATCH)) != 0 for one in (found, alone)]
+    assert 0.01 < rejected[0].mean() < 0.5
+    assert (rejected[0] == rejected[1]).mean() > 0.98
+
+
+@pytest.mark.parametrize("form", ["bool", "flags"])
+def test_intervals_of__masked_pixels_are_as_those_without_values(volume, form):
+    masked = np.zeros(volume.shape[:2], np.bool_)
+    masked[30:60, 40:90] = True
+    probability = softmax(np.where(np.isfinite(volume), volume, np.inf), 2)
+    valid = ~masked if form == "bool" else np.where(masked, np.uint16(INVALID), np.uint16(0))
+    found = intervals_of(probability, DISPARITIES, kind="probability", valid=valid)
+    gaps = np.where(masked[..., np.newaxis], np.nan, probability)
+    expected = intervals_of(gaps, DISPARITIES, kind="probability")
+    for name in ("disparity", "lower", "upper"):
+        np.testing.assert_array_equal(found[name].data, expected[name].data)
+
+
 def test_intervals_of__cuts_probabilities_by_the_largest_of_a_pixel(volume):
     probabilities = softmax(volume, 60)
     found = intervals_of(probabilities, DISPARITIES, kind="probability", config=RAW)

@@ -271,6 +271,21 @@ def test_match_pair__tiles_equal_one_tile_on_a_real_pair(shared_data, tmp_path):
     assert interval <= 0.0025
 
 
+class _Matcher:
+    """A matcher with a parameter that its name does not tell."""
+
+    def __call__(self, left, right, first):
+        raise AssertionError
+
+
+@pytest.mark.parametrize("matcher", [_Matcher(), lambda left, right, first: None, "x"])
+def test_match_pair__a_matcher_without_a_name_needs_one(pair, tmp_path, matcher):
+    left, right, settings = pair
+    given = {"preset": "paper", "disparity": settings["disparity"], "cost": {"method": "volume"}}
+    with pytest.raises(SatIntervalsError, match=r"cost\.name|give the function"):
+        match_pair(left, right, tmp_path / "out", given, volume_of=matcher)
+
+
 def test_match_block__of_another_version_is_refused(pair, tmp_path):
     left, right, settings = pair
     job = prepare(left, right, tmp_path, in_tiles(settings, 64))
@@ -328,11 +343,16 @@ def test_match_pair__resumes_only_with_the_same_function(pair, tmp_path):
 def test_match_pair__refuses_a_function_that_does_not_fit(pair, tmp_path):
     left, right, settings = pair
     own = settings | OWN
+    named = own | {"cost": OWN["cost"] | {"name": "wrong 1"}}
     for given, volume_of, message in (
         (settings, census_volume, "volume_of is given, but cost.method is census"),
         (own, None, "give match_pair volume_of"),
-        (own, lambda left, right, first: left, r"volume_of returned \(102, 152\) of float32, needed are \(100, 150, "),
-        (own, lambda *images: 100 * census_volume(*images), "values are outside 0 to 8"),
+        (
+            named,
+            lambda left, right, first: left,
+            r"volume_of returned \(102, 152\) of float32, needed are \(100, 150, ",
+        ),
+        (named, lambda *images: 100 * census_volume(*images), "values are outside 0 to 8"),
         (own | {"disparity": {"local": True}}, census_volume, "leave out local ranges"),
     ):
         with pytest.raises(SatIntervalsError, match=message):
