@@ -170,7 +170,7 @@ def test_intervals_of__cross_checks_probabilities_against_a_right_volume(volume)
         inside = (columns + disparity >= 0) & (columns + disparity < volume.shape[1])
         right[:, inside, index] = probability[:, columns[inside] + disparity, DISPARITIES.size - 1 - index]
     total = np.nansum(right, axis=2, keepdims=True)
-    right /= np.where(total > 0, total, 1)
+    right /= np.where(total > 0, total, np.nan)
     how = {"kind": "probability", "disparities": DISPARITIES}
     found, alone = intervals_of(probability, right=right, **how), intervals_of(probability, **how)
     rejected = [(one["validity"].data & (OCCLUSION | MISMATCH)) != 0 for one in (found, alone)]
