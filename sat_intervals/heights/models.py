@@ -86,12 +86,12 @@ class SensorImage:
         down, across = row - self.origin[0], column - self.origin[1]
         return (down >= 0) & (down <= self.image.height) & (across >= 0) & (across <= self.image.width)
 
-    def check_height(self, height: float) -> None:
-        """Raise if a height is outside the domain of the model."""
+    def check_height(self, height: float, what: str = "height") -> None:
+        """Raise if a height is outside the domain of the model; ``what`` it is, for the message."""
         if abs(height - self.model.offset_alt) > _DOMAIN * self.model.scale_alt:
             lowest, highest = self.heights
             raise SatIntervalsError(
-                f"height {height:g} m: {self.file} is for {lowest:g} to {highest:g} m above the ellipsoid: give a "
+                f"{what} {height:g} m: {self.file} is for {lowest:g} to {highest:g} m above the ellipsoid: give a "
                 "height in this range"
             )
 

@@ -185,6 +185,51 @@ def test_models__of_all_files_give_the_same_images(kind, made, raw, tmp_path):
         assert_allclose(read_model(model).inverse_loc(*place), read_model(file).inverse_loc(*place), rtol=0, atol=1e-9)
 
 
+def test_models__of_a_dimap_tile_and_of_nitf_are_those_of_the_image(raw, tmp_path):
+    from sat_intervals.heights.models import read_model
+    from sat_intervals.raster import find_model
+
+    place = np.array([1.451]), np.array([43.599]), np.array([30.0])
+    row, column, _ = read_model(raw[0]).inverse_loc(*place)
+    tile = tmp_path / "IMG_A_R1C2.TIF"  # its first column is the 301st
+    _without_tags(raw[0], tile)
+    _write_dimap(raw[0], tile, 300)
+    assert_allclose(read_model(find_model(str(tile))).inverse_loc(*place)[:2], (row, column - 300), rtol=0, atol=1e-6)
+    copy(str(raw[0]), str(tmp_path / "left.ntf"), driver="NITF")
+    there = read_model(find_model(str(tmp_path / "left.ntf"))).inverse_loc(*place)[:2]
+    assert_allclose(there, (row, column), rtol=0, atol=0.6)  # NITF has whole lines and samples
+
+
+def _write_dimap(file, tile, columns):
+    """Write the metadata and the model of a product whose second tile is an image; counted from 1."""
+    with rasterio.open(file) as dataset:
+        known = dataset.rpcs.to_dict()
+    numbers = "".join(
+        f"<{axis}_{what}_COEFF_{i}>{value!r}</{axis}_{what}_COEFF_{i}>"
+        for axis in ("SAMP", "LINE")
+        for what in ("NUM", "DEN")
+        for i, value in enumerate(known[f"{axis}_{what}_coeff".lower()], 1)
+    )
+    names = [f"{axis}_{what}" for axis in ("line", "samp", "lat", "long", "height") for what in ("off", "scale")]
+    domain = "".join(
+        f"<{name.upper()}>{known[name] + (name in ('line_off', 'samp_off'))!r}</{name.upper()}>" for name in names
+    )
+    tile.with_name("RPC_A.XML").write_text(
+        '<Dimap_Document><Metadata_Identification><METADATA_FORMAT version="2.0">DIMAP</METADATA_FORMAT>'
+        f"</Metadata_Identification><Rational_Function_Model><Global_RFM><Direct_Model>{numbers}</Direct_Model>"
+        f"<Inverse_Model>{numbers}</Inverse_Model><RFM_Validity>{domain}</RFM_Validity>"
+        "</Global_RFM></Rational_Function_Model></Dimap_Document>"
+    )
+    tile.with_name("DIM_A.XML").write_text(
+        "<Dimap_Document><Raster_Data><Data_Access><Data_Files>"
+        '<Data_File tile_R="1" tile_C="1"><DATA_FILE_PATH href="IMG_A_R1C1.TIF"/></Data_File>'
+        f'<Data_File tile_R="1" tile_C="2"><DATA_FILE_PATH href="{tile.name}"/></Data_File>'
+        "</Data_Files></Data_Access><Raster_Dimensions><Tile_Set><Regular_Tiling>"
+        f'<NTILES_SIZE nrows="2000" ncols="{columns}"/></Regular_Tiling></Tile_Set></Raster_Dimensions></Raster_Data>'
+        "</Dimap_Document>"
+    )
+
+
 def _without_tags(file, path):
     with rasterio.open(file) as dataset:
         pixels, profile = dataset.read(), dataset.profile
@@ -264,6 +309,34 @@ def test_rectify__follows_a_dem(raw, tmp_path):
     )
 
 
+def test_rectify__a_dem_that_just_covers_is_enough_and_bad_ones_are_refused_in_one_line(made, raw, tmp_path):
+    from surfaces import write_raster
+
+    nodes = np.moveaxis(read_layers(made / "left_grid.tif"), 0, -1)[::-1, ::-1].reshape(-1, 2)
+    left, _ = sensor_images(raw[0].parent)
+    ground = left.model.direct_loc_h(nodes[:, 1], nodes[:, 0], 12.0)[:, :2]
+    (west, south), (east, north) = ground.min(axis=0), ground.max(axis=0)
+
+    def raster(name, heights, beyond, moved=0.0):
+        size = (east - west + 2 * beyond) / 40, (north - south + 2 * beyond) / 40
+        place = Affine(size[0], 0, west - beyond + moved, 0, -size[1], north + beyond)
+        return write_raster(tmp_path / name, np.broadcast_to(heights, (1, 40, 40)).copy(), place, "EPSG:4326")
+
+    slope = 10 + 0.1 * np.arange(40.0)
+    assert invoke("rectify", *raw, tmp_path / "out", "--dem", raster("dem.tif", slope, 1e-4)).exit_code == 0
+    assert json.loads((tmp_path / "out" / "rectify.json").read_text())["rows"]["survey"]["rows"]["before"][0] < 0.1
+    (tmp_path / "junk.gtx").write_text("junk")
+    dem, away = tmp_path / "dem.tif", raster("away.tif", slope, 1e-4, moved=1.0)
+    for words, parts in (
+        ((raster("narrow.tif", slope, -5e-4),), ["narrow.tif does not cover"]),
+        ((raster("feet.tif", 400 + slope, 1e-4),), ["feet.tif: median height 41", "-48 to 72 m"]),
+        ((raster("empty.tif", np.nan * slope, 1e-4),), ["cannot read", "empty.tif as DEM"]),
+        ((dem, "--geoid", away), ["dem.tif with", "away.tif has no heights"]),
+        ((dem, "--geoid", tmp_path / "junk.gtx"), ["as DEM", "junk.gtx"]),
+    ):
+        refused(["rectify", *raw, tmp_path / "bad", "--dem", *words], *parts)
+
+
 @pytest.mark.parametrize(
     ("options", "parts"),
     [
@@ -319,6 +392,9 @@ def test_surface__of_raw_images_has_the_heights_of_the_scene_and_later_commands_
     assert invoke("dsm", run, *SETTINGS).exit_code == 0
     assert_array_equal(read_layers(run / "dsm.tif"), read_layers(out / "dsm.tif"))
     assert invoke("surface", out / "left.tif", out / "right.tif", run, *SETTINGS).exit_code == 0
+    (run / "geometry.json").unlink()
+    assert invoke("rectify", *raw, out, "--altitude", 20, "--overwrite").exit_code == 0
+    refused(["dsm", run, *SETTINGS], "left.tif was rectified again")
 
 
 def test_surface__of_a_model_that_is_off_recovers_the_rows_or_ends_with_one_line(scene, tmp_path):
