@@ -2,11 +2,12 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 import rasterio
-from helpers import contents, invoke, refused
+from helpers import contents, fail, invoke, refused
 from numpy.testing import assert_allclose, assert_array_equal
 from rasterio.shutil import copy
 from rasterio.transform import Affine
@@ -134,12 +135,51 @@ def test_rectify__makes_the_overlap_and_a_record(made, raw):
     assert (left_longitude, left_latitude) == pytest.approx((1.45, 43.6), abs=0.005)
 
 
-def test_rectify__is_done_once_and_refuses_other_settings(made, raw):
+def test_rectify__is_done_once_and_refuses_other_settings(made, raw, tmp_path):
     before = contents(made)
     assert invoke("rectify", *raw, made).exit_code == 0
     assert contents(made) == before
     refused(["rectify", *raw, made, "--altitude", 20], "settings.altitude was null, now 20.0", "--overwrite")
-    refused(["rectify", made / "left.tif", made / "right.tif", made], "has no RPC model")
+    epipolar = made / "left.tif", made / "right.tif"
+    refused(["rectify", *epipolar, made / "again", "--left-model", raw[0]], "are an epipolar pair already")
+    for words in (("--left-model", raw[0], "--right-model", raw[1]), ("--resolution-of", "left"), ("--altitude", 20)):
+        refused(["surface", *epipolar, made / "again", *words, *SETTINGS], words[0], "is for raw images")
+    mask = shutil.copy(raw[0], tmp_path / "left_grid.tif")
+    refused(["rectify", *raw, tmp_path, "--left-mask", mask, "--overwrite"], "left_grid.tif is an input")
+
+
+def test_rectify__keeps_a_finished_pair_until_the_new_one_is_made_and_compares_rows_later(
+    made, raw, tmp_path, monkeypatch
+):
+    from sat_intervals.heights import rectify
+
+    left, right = (Path(shutil.copy(file, tmp_path)) for file in raw)
+    model = Path(shutil.copy(left, tmp_path / "model.tif"))
+    out = tmp_path / "out"
+    words = "rectify", left, right, out, "--left-model", model
+    write_images = rectify._write_images
+
+    def changing(*arguments):
+        write_images(*arguments)
+        with model.open("ab") as stream:
+            stream.write(b" ")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(rectify, "_write_images", changing)
+        result = invoke(*words)
+        assert result.exit_code == 1
+        assert "left_model" in result.stderr
+        assert not [*out.glob("*.tif"), *out.glob("*.json")]
+    assert invoke("surface", *words[1:], "--right-model", right, *SETTINGS).exit_code == 0
+    assert json.loads((out / "rectify.json").read_text())["rows"] is None
+    images = (out / "left.tif").read_bytes()
+    assert "rows correspond within 0.1 px" in invoke(*words, "--right-model", right).output
+    assert (out / "left.tif").read_bytes() == images
+    before = contents(out)
+    with monkeypatch.context() as patched:
+        patched.setattr(rectify, "_write_images", fail)
+        assert invoke(*words, "--altitude", 20, "--overwrite").exit_code == 1
+    assert contents(out) == before
 
 
 def test_rectify__resumes_what_a_death_left_and_keeps_files_of_others(made, raw, tmp_path):
