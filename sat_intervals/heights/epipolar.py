@@ -1,5 +1,6 @@
 """Epipolar grids of a raw pair: where it overlaps, at which height, how large pixels are, and the grids of shareloc."""
 
+import logging
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -151,12 +152,21 @@ def shareloc_grids(
         )
         for one, part in zip(images, parts, strict=True)
     ]
-    with warnings.catch_warnings(action="ignore"):
-        left, right, shape, base = compute_stereorectification_epipolar_grids(
-            areas[0], images[0].model, areas[1], images[1].model, elevation, epi_step=STEP, margin=MARGIN
-        )
+    root = logging.getLogger()  # to which shareloc tells that nodes are NaN
+    root.addFilter(_drop)
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            left, right, shape, base = compute_stereorectification_epipolar_grids(
+                areas[0], images[0].model, areas[1], images[1].model, elevation, epi_step=STEP, margin=MARGIN
+            )
+    finally:
+        root.removeFilter(_drop)
     nodes = np.ascontiguousarray(left[..., :2]), np.ascontiguousarray(right[..., :2])
     return nodes, (int(shape[0]), int(shape[1])), float(base)
+
+
+def _drop(record: logging.LogRecord) -> bool:
+    return False
 
 
 def _pixel_size(of: SensorImage, part: Window, height: float) -> float:

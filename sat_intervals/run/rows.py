@@ -27,11 +27,12 @@ def compared_rows(left: Path, right: Path, progress: Progress) -> dict[str, Any]
     text = "not compared: too few matches"
     if rows := survey.rows:
         is_taken = survey.is_large and not rows.contradiction
-        does = "match takes them out" if is_taken else "left as they are"
-        agree = "correspond" if (rows.after if is_taken else rows.before)[0] <= _AGREE else "do not correspond"
+        does = "match takes them out" if is_taken else "match leaves them"
+        left_over = (rows.after if is_taken else rows.before)[0]
+        verdict = f"correspond within {_AGREE:g} px" if left_over <= _AGREE else f"differ by {left_over:.2f} px"
         text = (
             f"offsets of {rows.before[0]:.2f} px in the median, up to {rows.most:.2f} px; {does}; a smooth function "
-            f"leaves {rows.after[0]:.2f} px on other matches: rows {agree} within {_AGREE:g} px"
+            f"leaves {rows.after[0]:.2f} px on other matches: rows {verdict}"
         )
     warnings = rows_left(survey, "auto", str(right))
     return {"text": text, "warnings": warnings, "search": search, "survey": survey.report()}
