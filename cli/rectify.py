@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
 
 
-def _raw(*, dem: Path | None, altitude: float | None, resolution_of: str) -> dict[str, Any]:
+def _raw(*, dem: Path | None, altitude: float | None, resolution_of: str | None) -> dict[str, Any]:
     return {"dem": dem, "altitude": altitude, "resolution_of": resolution_of}
 
 
@@ -41,8 +41,7 @@ def raw_options(command: Command) -> Command:
         click.option(
             "--resolution-of",
             type=click.Choice(("coarser", "left")),
-            default="coarser",
-            help="Raw images: whose pixel size the epipolar images get, if they differ by more than 10 %.",
+            help="Raw images: whose pixel size to take if they differ by more than 10 %; default coarser.",
         ),
     )(command)
 
@@ -110,7 +109,7 @@ def rectified(
 
     left, right = pair.open()
     terrain = Terrain(raw["dem"], raw["altitude"], raw["geoid"])
-    raw_pair = RawPair(left, right, models, terrain, raw["resolution_of"])
+    raw_pair = RawPair(left, right, models, terrain, raw["resolution_of"] or "coarser")
     compare = partial(compared_rows, progress=console.progress) if rows else None
     record = rectify(raw_pair, out, overwrite=overwrite, compare=compare, progress=console.progress)
     for side in ("left", "right"):

@@ -66,15 +66,14 @@ def surface(
     config = settings.load()
     with Console(run.quiet or as_json) as console:
         from sat_intervals.config import resolved
+        from sat_intervals.heights.sensors import Sensors
 
-        interval = resolved(config).interval
-        _check(cells, None, interval)
+        _check(cells, resolved(config).interval)
         raw |= {"geoid": cells["geoid"] if raw["dem"] else None}
-        given = sensor_files[0] if sensor_files else ()
-        _check_kept(out, cells, [*given, *pair.files], settings.file)
+        given, images = sensor_files[0] if sensor_files else (), pair.files
         pair, files = _epipolar(pair, given, raw, out, console, overwrite=run.overwrite)
-        _check(cells, files, interval)
-        _check_kept(out, cells, [*files, *pair.files], settings.file)
+        _check_kept(out, cells, [*files, *images], settings.file)
+        Sensors.load(*map(Path, files))  # raises before hours of matching
         left, right = pair.open()
         report = run.match(left, right, out, config, window=pair.window, progress=console.progress)
         made = _surface(out, files, cells, console)
@@ -96,11 +95,16 @@ def _epipolar(
     overwrite: bool,
 ) -> tuple[PairArguments, SensorFiles]:
     """Return an epipolar pair with its models and grids; raw images are rectified in the folder of the run."""
-    from sat_intervals.heights.rectified import GRIDS, IMAGES, rectified_files
+    from sat_intervals.heights.rectified import IMAGES, rectified_files
 
-    if len(given) == 2 + len(GRIDS):
-        return pair, (given[0], given[1], given[2], given[3])
-    if not given and (made := rectified_files(*pair.images)):
+    has_grids = len(given) > len(IMAGES)
+    if made := (given[0], given[1], given[2], given[3]) if has_grids else rectified_files(*pair.images):
+        options = {"--left-model without --left-grid": given and not has_grids}
+        options |= {
+            f"--{name.replace('_', '-')}": raw[name] is not None for name in ("dem", "altitude", "resolution_of")
+        }
+        for name in (name for name, is_given in options.items() if is_given):
+            raise click.UsageError(f"{name} is for raw images, {pair.images[0]} is an epipolar image: leave it out.")
         return pair, made
     if pair.window:
         raise click.UsageError("--window is a region of an epipolar image: rectify these raw images, then match them.")
@@ -144,15 +148,12 @@ def _surface(out: Path, sensor_files: SensorFiles, cells: dict[str, Any], consol
     return make_surface([out], out / "dsm.tif", **cells, progress=console.progress)
 
 
-def _check(cells: dict[str, Any], sensor_files: Sequence[str | Path] | None, interval: "Interval | None") -> None:
-    """Raise for what the later steps cannot use, before hours of matching."""
+def _check(cells: dict[str, Any], interval: "Interval | None") -> None:
+    """Raise for cells that the surface cannot have, before hours of matching."""
     from sat_intervals.heights.dsm import checked_cells, surface_tags
-    from sat_intervals.heights.sensors import Sensors
 
     _, cell, _, radius = checked_cells(*(cells[name] for name in ("resolution", "crs", "radius", "geoid")))
     surface_tags(["run"], [interval], cells["choices"].for_intervals([interval]), cell, radius)
-    if sensor_files:
-        Sensors.load(*map(Path, sensor_files))
 
 
 def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -> "Finish":
@@ -166,7 +167,7 @@ def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -
     cells = {"crs": None, "radius": None, "geoid": None, "choices": SurfaceChoices()}
     errors: dict[str, SatIntervalsError] = {}
     if any(pair.resolution for pair in pairs):
-        import sat_intervals.heights.sensors  # noqa: F401 (without its extra it raises, for all pairs)
+        from sat_intervals.heights.sensors import Sensors  # without its extra it raises, for all pairs
     _check_kept_by_all(pairs, out)
     for pair in pairs:
         if not pair.resolution:
@@ -174,7 +175,9 @@ def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -
         of_pair = {"resolution": pair.resolution, **cells}
         _check_kept(out / pair.name, of_pair, pair.sensors or ())
         try:
-            _check(of_pair, pair.sensors if _has_grids(pair) else None, None)
+            _check(of_pair, None)
+            if pair.sensors and _has_grids(pair):
+                Sensors.load(*map(Path, pair.sensors))
         except SatIntervalsError as error:
             errors[pair.name] = error
             click.echo(f"{pair.name}: there will be no surface: {error}", err=True)
@@ -208,7 +211,7 @@ def epipolar_pairs(out: Path, console: "Console", *, overwrite: bool) -> "Begin"
         nodata, band = map(tuple, kinds)
         window = Window(*pair.window) if pair.window else None
         images = PairArguments((pair.left, pair.right), (pair.left_mask, pair.right_mask), nodata, band, window)
-        raw = {"dem": None, "altitude": None, "geoid": None, "resolution_of": "coarser"}
+        raw = {"dem": None, "altitude": None, "geoid": None, "resolution_of": None}
         given = tuple(map(Path, pair.sensors or ()))
         made, files = _epipolar(images, given, raw, out / pair.name, console, overwrite=overwrite)
         left, right = made.images

@@ -95,7 +95,7 @@ class Run:
         """Raise if an output would replace a file of the run, one of its inputs, the truth, or one of ``inputs``."""
         own = [self.out / name for name in (*_BANDS, "run.json")]
         grid = self.config.disparity.grid  # other rasters are inputs
-        check_not_replaced([*own, *_paths(self.report["inputs"]), grid, self.truth_beside, *inputs], outputs)
+        check_not_replaced([*own, *paths_of(self.report["inputs"]), grid, self.truth_beside, *inputs], outputs)
 
     def layer(self, path: str | Path) -> Layer:
         """Open another raster of the same pixels, such as the truth."""
@@ -185,10 +185,10 @@ def open_run(out: str | Path) -> Run:
     return Run(file.parent, report, config, region, places[-1])
 
 
-def _paths(inputs: Any) -> Iterator[str]:
+def paths_of(inputs: Any) -> Iterator[str]:
     """Yield the paths of all files in the section ``inputs`` of a report, at any depth."""
     for value in inputs.values() if isinstance(inputs, dict) else inputs if isinstance(inputs, list) else ():
-        yield from _paths(value)
+        yield from paths_of(value)
     if isinstance(inputs, dict) and "path" in inputs:
         yield inputs["path"]
 

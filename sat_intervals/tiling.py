@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from math import ceil, floor
 from typing import NamedTuple
 
 import numpy as np
@@ -35,6 +36,13 @@ class Window:
     def in_words(self) -> str:
         """Return first and last rows and columns, for messages and tags."""
         return f"rows {self.row} to {self.row_stop - 1}, columns {self.column} to {self.column_stop - 1}"
+
+    @classmethod
+    def around(cls, first: Sequence[float], last: Sequence[float]) -> "Window":
+        """Return the window of whole pixels around the part from ``first`` to ``last``, rows and columns."""
+        row, column = map(floor, first)
+        row_stop, column_stop = map(ceil, last)
+        return cls(row, column, row_stop - row, column_stop - column)
 
     def grown(self, rows: int, columns: int | tuple[int, int]) -> "Window":
         """Return the window grown by ``rows`` above and below and ``columns`` (or a pair) left and right."""

@@ -1,5 +1,6 @@
 """Epipolar grids of a raw pair: where it overlaps, at which height, how large pixels are, and the grids of shareloc."""
 
+import logging
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError, check_file
-from sat_intervals.heights.models import SensorImage, common_parts, shares_at
+from sat_intervals.heights.models import SensorImage, common_parts, read_with, shares_at
 from sat_intervals.kernels.compiled import kernels_of_others
 from sat_intervals.raster import Georeferencing, window_of_ground
 from sat_intervals.tiling import Window
@@ -31,7 +32,7 @@ _HEIGHTS, _AS_GOOD = 64, 0.99
 _EQUAL = 1.1
 # Base-to-height ratio below which a pixel of disparity is more than 25 m in an image of .5 m.
 _LEAST_BASE = 0.02
-# Degrees of a DEM around the overlap.
+# Degrees of a DEM around the nodes, for ground that is higher or lower.
 _AROUND = 0.02
 
 
@@ -89,17 +90,17 @@ def epipolar_geometry(left: SensorImage, right: SensorImage, terrain: Terrain, r
     height = likely_height(left, right) if terrain.altitude is None else terrain.altitude
     for one in (left, right):
         one.check_height(height)
-    elevation = _dem(left, right, terrain.dem, terrain.geoid, height) if terrain.dem else height
-    share, parts = common_parts(left, right, elevation, _BEYOND)
-    if parts is None:
-        raise SatIntervalsError(
-            f"{left.image.path} and {right.image.path} do not overlap at {height:.0f} m above the ellipsoid: give "
-            "images of one place, their models, or another --altitude"
-        )
+    share, parts = _overlap(left, right, height, f"at {height:.0f} m above the ellipsoid")
     sizes = [_pixel_size(one, part, height) for one, part in zip((left, right), parts, strict=True)]
     ratio = sizes[1] / sizes[0]
     spacing = ratio if resolution_of == "coarser" and ratio > _EQUAL else 1.0
-    nodes, shape, base = shareloc_grids((left, right), parts, elevation, spacing)
+    nodes, shape, base = shareloc_grids((left, right), parts, height, spacing)
+    if terrain.dem:
+        elevation = _dem(left, right, nodes[0], terrain, height)
+        share, parts = _overlap(left, right, elevation, f"on {terrain.dem}")
+        nodes, shape, base = shareloc_grids((left, right), parts, elevation, spacing)
+        if not np.isfinite([base, *map(np.sum, nodes)]).all():
+            raise SatIntervalsError(f"{terrain.dem} does not cover the epipolar images: give a larger DEM")
     base_to_height = base * sizes[0]
     if not base_to_height >= _LEAST_BASE:
         raise SatIntervalsError(
@@ -116,6 +117,17 @@ def epipolar_geometry(left: SensorImage, right: SensorImage, terrain: Terrain, r
         "footprint": _footprint(left, nodes[0], shape, height),
     }
     return Epipolar(*nodes, *shape, (left_scale, right_scale), figures)
+
+
+def _overlap(left: SensorImage, right: SensorImage, elevation: Any, where: str) -> tuple[float, tuple[Window, Window]]:
+    """Return share and parts of the overlap, see `common_parts`; raise if there is none."""
+    share, parts = common_parts(left, right, elevation, _BEYOND)
+    if parts is None:
+        raise SatIntervalsError(
+            f"{left.image.path} and {right.image.path} do not overlap {where}: give images of one place, their models, "
+            "or another --altitude"
+        )
+    return share, parts
 
 
 def likely_height(left: SensorImage, right: SensorImage) -> float:
@@ -140,12 +152,21 @@ def shareloc_grids(
         )
         for one, part in zip(images, parts, strict=True)
     ]
-    with warnings.catch_warnings(action="ignore"):
-        left, right, shape, base = compute_stereorectification_epipolar_grids(
-            areas[0], images[0].model, areas[1], images[1].model, elevation, epi_step=STEP, margin=MARGIN
-        )
+    root = logging.getLogger()  # to which shareloc tells that nodes are NaN
+    root.addFilter(_drop)
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            left, right, shape, base = compute_stereorectification_epipolar_grids(
+                areas[0], images[0].model, areas[1], images[1].model, elevation, epi_step=STEP, margin=MARGIN
+            )
+    finally:
+        root.removeFilter(_drop)
     nodes = np.ascontiguousarray(left[..., :2]), np.ascontiguousarray(right[..., :2])
     return nodes, (int(shape[0]), int(shape[1])), float(base)
+
+
+def _drop(record: logging.LogRecord) -> bool:
+    return False
 
 
 def _pixel_size(of: SensorImage, part: Window, height: float) -> float:
@@ -164,17 +185,21 @@ def _footprint(left: SensorImage, nodes: np.ndarray, shape: tuple[int, int], hei
     return [[round(float(value), 7) for value in corner[:2]] for corner in ground]
 
 
-def _dem(left: SensorImage, right: SensorImage, dem: Path, geoid: Path | None, height: float) -> Any:
-    """Return the DEM around the overlap as shareloc reads it, or its only height; raise if it does not cover it."""
-    _, parts = common_parts(left, right, height, _BEYOND)
-    part = parts[0] if parts else Window(0, 0, left.image.height, left.image.width)
-    rows = left.origin[0] + part.row + np.array([0.0, 0.0, part.height, part.height])
-    columns = left.origin[1] + part.column + np.array([0.0, part.width, 0.0, part.width])
-    ground = left.model.direct_loc_h(rows, columns, height)[:, :2]
-    window = window_of_ground(dem, (*ground.min(axis=0), *ground.max(axis=0)), _AROUND)
+def _dem(left: SensorImage, right: SensorImage, nodes: np.ndarray, terrain: Terrain, height: float) -> Any:
+    """Return the DEM around the left nodes as shareloc reads it, or its only height; raise if it does not cover them.
+
+    shareloc goes from node to node, also where they are far from the overlap.
+    """
+    dem, geoid = str(terrain.dem), terrain.geoid and str(terrain.geoid)
+    ground = left.model.direct_loc_h(*nodes[:: len(nodes) - 1].reshape(-1, 2).T, height)[:, :2]
+    window = window_of_ground(Path(dem), (*ground.min(axis=0), *ground.max(axis=0)), _AROUND)
     roi = [window.row, window.column, window.row_stop, window.column_stop]
-    with warnings.catch_warnings(action="ignore"):
-        read = dtm_reader(str(dem), geoid and str(geoid), roi=roi)
+    read = read_with(Path(dem), "DEM", lambda name: dtm_reader(name, geoid, roi=roi))
+    if not np.isfinite(read.alt_data).all():
+        given = f"{dem} with {geoid}" if geoid else dem
+        raise SatIntervalsError(f"{given} has no heights at a part of the images: give files that cover them")
+    for one in (left, right):
+        one.check_height(float(np.median(read.alt_data)), f"{dem}: median height")
     if not np.ptp(read.alt_data):  # the sea: shareloc finds no points on one height
         return float(read.alt_data.flat[0])
     return DTMIntersection(read.epsg, read.alt_data, read.nb_rows, read.nb_columns, read.transform)

@@ -83,8 +83,13 @@ def geometry_of(run: Run, progress: Progress = lambda stage, done, total: None) 
     """
     from sat_intervals.heights.sensors import lattice_of
 
-    images = (run.report["inputs"][side]["path"] for side in ("left", "right"))
-    if not (run.out / FILE).exists() and (made := rectified_files(*images)):
+    images = [run.report["inputs"][side] for side in ("left", "right")]
+    if not (run.out / FILE).exists() and (made := rectified_files(*(image["path"] for image in images))):
+        for image in images:
+            if identity(image["path"], {image["path"]: image}).get("sha256") != image.get("sha256"):
+                raise SatIntervalsError(
+                    f"{image['path']} was rectified again since {run.out} was made: match it again with --overwrite"
+                )
         set_geometry(run, *made)
     paths = _noted(run)
     sensors, report = _sensors(run, paths)

@@ -86,12 +86,12 @@ class SensorImage:
         down, across = row - self.origin[0], column - self.origin[1]
         return (down >= 0) & (down <= self.image.height) & (across >= 0) & (across <= self.image.width)
 
-    def check_height(self, height: float) -> None:
-        """Raise if a height is outside the domain of the model."""
+    def check_height(self, height: float, what: str = "height") -> None:
+        """Raise if a height is outside the domain of the model; ``what`` it is, for the message."""
         if abs(height - self.model.offset_alt) > _DOMAIN * self.model.scale_alt:
             lowest, highest = self.heights
             raise SatIntervalsError(
-                f"height {height:g} m: {self.file} is for {lowest:g} to {highest:g} m above the ellipsoid: give a "
+                f"{what} {height:g} m: {self.file} is for {lowest:g} to {highest:g} m above the ellipsoid: give a "
                 "height in this range"
             )
 
@@ -148,8 +148,8 @@ def common_parts(
     if not inside.any():
         return 0.0, None
     between = beyond + max(left.image.height, left.image.width) // (_SAMPLES - 1) + 1
-    left_part = _part(left, rows[inside], columns[inside], between)
-    return float(inside.mean()), (left_part, _part(right, there[inside, 0], there[inside, 1], between))
+    left_part = _part(left, np.stack([rows, columns], axis=1)[inside], between)
+    return float(inside.mean()), (left_part, _part(right, there[inside, :2], between))
 
 
 def _spread(of: SensorImage) -> tuple[np.ndarray, np.ndarray]:
@@ -164,9 +164,8 @@ def _in_right(left: SensorImage, right: SensorImage, rows: np.ndarray, columns: 
         return coloc(left.model, right.model, rows, columns, elevation)[0]
 
 
-def _part(of: SensorImage, row: np.ndarray, column: np.ndarray, beyond: int) -> Window:
-    """Return the window around positions."""
-    first = int(np.floor(row.min() - of.origin[0])) - beyond, int(np.floor(column.min() - of.origin[1])) - beyond
-    last = int(np.ceil(row.max() - of.origin[0])) + beyond, int(np.ceil(column.max() - of.origin[1])) + beyond
-    found = Window(*first, last[0] - first[0], last[1] - first[1])
-    return found.clipped(Window(0, 0, of.image.height, of.image.width))
+def _part(of: SensorImage, places: np.ndarray, beyond: int) -> Window:
+    """Return the part of an image around rows and columns in the whole image, ``(n, 2)``."""
+    places = places - of.origin
+    around = Window.around(places.min(axis=0), places.max(axis=0)).grown(beyond, beyond)
+    return around.clipped(Window(0, 0, of.image.height, of.image.width))

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sat_intervals.errors import ChangedInputError, SatIntervalsError
-from sat_intervals.heights.rectified import FILE, GRIDS, IMAGES, read_record
+from sat_intervals.heights.rectified import FILE, GRIDS, IMAGES, read_record, rectified_files
 from sat_intervals.products import Band
 from sat_intervals.progress import Progress
 from sat_intervals.raster import File, Georeferencing, Image, OutputWriter, check_not_replaced, describe
 from sat_intervals.raster.identity import identity
 from sat_intervals.raster.publishing import check_free, write_file
+from sat_intervals.results import paths_of
 from sat_intervals.store.lock import locked
 from sat_intervals.store.manifest import differences
 
@@ -56,36 +57,58 @@ def rectify(
 ) -> dict[str, Any]:
     """Write ``left.tif``, ``right.tif``, ``left_grid.tif``, ``right_grid.tif`` and ``rectify.json`` to a folder.
 
-    Returns the content of ``rectify.json``; nothing is done if the folder has that of the same inputs and settings.
+    Returns the content of ``rectify.json``. What the folder has of the same inputs and settings is kept; rows are
+    compared if they were not.
     """
     from sat_intervals.heights.models import SensorImage
 
     pair.terrain.check()
+    if rectified_files(pair.left.path, pair.right.path):
+        raise SatIntervalsError(f"{pair.left.path} and {pair.right.path} are an epipolar pair already: match them")
     progress("geometry", 0, 1)
     left, right = (SensorImage.of(*one) for one in zip((pair.left, pair.right), pair.models, strict=True))
     with locked(out):
-        before = read_record(out) or {}
-        asked = _asked(pair, left, right, before.get("inputs", {}))
-        if not _is_needed(out, asked, before, overwrite=overwrite):
-            return before
-        from sat_intervals.heights.epipolar import epipolar_geometry
-
-        geometry = epipolar_geometry(left, right, pair.terrain, pair.resolution_of)
-        # from now on, files in the folder may be what a death of this command has left
-        write_file(out / FILE, json.dumps(asked | {"finished": None}, indent=1).encode())
-        with _writer(out, pair, geometry) as images, _grid_writer(out, geometry) as grids:
-            _write_images(images, (left, right), geometry, progress)
-            grids.write(0, *(np.moveaxis(nodes[..., ::-1], -1, 0) for nodes in (geometry.left, geometry.right)))
-            if changes := list(differences(asked, _asked(pair, left, right, asked["inputs"]))):
-                raise ChangedInputError(f"an input was changed meanwhile ({'; '.join(changes)}): rerun the command")
-            images.publish()
-            grids.publish()
-        record = asked | geometry.figures
-        record["bounds"] = "the upper bound of the disparity is the lower height"
-        record["rows"] = compare(*(out / name for name in IMAGES)) if compare else None
-        record["finished"] = datetime.now(UTC).isoformat(timespec="seconds")
-        write_file(out / FILE, (json.dumps(record, indent=1) + "\n").encode())
+        record = read_record(out) or {}
+        asked = _asked(pair, left, right, record.get("inputs", {}))
+        if _is_needed(out, asked, record, overwrite=overwrite):
+            record = _make(pair, left, right, out, asked, progress)
+        if compare and record["rows"] is None:
+            record["rows"] = compare(*(out / name for name in IMAGES))
+            _note(out, record)
     return record
+
+
+def _make(
+    pair: RawPair,
+    left: "SensorImage",
+    right: "SensorImage",
+    out: Path,
+    asked: dict[str, Any],
+    progress: Progress,
+) -> dict[str, Any]:
+    """Write all files; return the record."""
+    from sat_intervals.heights.epipolar import epipolar_geometry
+
+    geometry = epipolar_geometry(left, right, pair.terrain, pair.resolution_of)
+    with _writer(out, pair, geometry) as images, _grid_writer(out, geometry) as grids:
+        _write_images(images, (left, right), geometry, progress)
+        grids.write(0, *(np.moveaxis(nodes[..., ::-1], -1, 0) for nodes in (geometry.left, geometry.right)))
+        if changes := list(differences(asked, _asked(pair, left, right, {}))):
+            raise ChangedInputError(f"an input was changed meanwhile ({'; '.join(changes)}): rerun the command")
+        # from now on, files in the folder may be what a death of this command has left
+        _note(out, asked | {"finished": None})
+        images.publish()
+        grids.publish()
+    record = asked | geometry.figures
+    record["bounds"] = "the upper bound of the disparity is the lower height"
+    record["rows"] = None
+    record["finished"] = datetime.now(UTC).isoformat(timespec="seconds")
+    _note(out, record)
+    return record
+
+
+def _note(out: Path, record: dict[str, Any]) -> None:
+    write_file(out / FILE, (json.dumps(record, indent=1) + "\n").encode())
 
 
 def _asked(pair: RawPair, left: "SensorImage", right: "SensorImage", known: dict[str, Any]) -> dict[str, Any]:
@@ -109,10 +132,10 @@ def _asked(pair: RawPair, left: "SensorImage", right: "SensorImage", known: dict
 def _is_needed(out: Path, asked: dict[str, Any], before: dict[str, Any], *, overwrite: bool) -> bool:
     """Return whether there is something to do; raise if files in the folder are not of this pair."""
     files = [out / name for name in (*IMAGES, *GRIDS)]
-    read = [file["path"] for one in asked["inputs"].values() for file in (one, *one.get("files", ()))]
-    check_not_replaced(read, [*files, out / FILE])
-    changes = list(differences({name: before.get(name) for name in asked}, asked)) if before else []
-    if before.get("finished") and not changes and all(file.exists() for file in files):
+    check_not_replaced(paths_of(asked["inputs"]), [*files, out / FILE])
+    is_finished = bool(before.get("finished"))
+    changes = list(differences({name: before.get(name) for name in asked}, asked)) if is_finished else []
+    if is_finished and not changes and all(file.exists() for file in files):
         return False
     if changes and not overwrite:
         raise SatIntervalsError(

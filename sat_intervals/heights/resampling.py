@@ -57,9 +57,7 @@ class Resampled:
         if not places.size:
             return None
         before, after = reach(self.scale)
-        first = np.floor(places.min(axis=0)).astype(int) - before
-        last = np.floor(places.max(axis=0)).astype(int) + after + 1
-        window = Window(int(first[0]), int(first[1]), *map(int, last - first))
+        window = Window.around(places.min(axis=0) - before, places.max(axis=0) + after + 1)
         inside = window.clipped(Window(0, 0, self.image.height, self.image.width))
         return window if inside.height and inside.width else None
 

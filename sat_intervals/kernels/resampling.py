@@ -25,6 +25,21 @@ def _keys(distance):
     return ((1.5 * d - 2.5) * d * d + 1 if d < 1 else ((-0.5 * d + 2.5) * d - 4) * d + 2) if d < 2 else 0.0
 
 
+@inlined
+def _line(nodes, y):
+    """Positions of the nodes of a line of the result, y lines of nodes from the first."""
+    i = int(y)
+    return nodes[i] + (y - i) * (nodes[i + 1] - nodes[i])
+
+
+@inlined
+def _place(line, x):
+    """Position in the image of a pixel of a line, x nodes from the first."""
+    j = int(x)
+    x -= j
+    return line[j, 0] + x * (line[j + 1, 0] - line[j, 0]), line[j, 1] + x * (line[j + 1, 1] - line[j, 1])
+
+
 @cached
 def resample(pixels, origin, nodes, step, first, rows, columns):
     """Resample a window of an image.
@@ -40,15 +55,9 @@ def resample(pixels, origin, nodes, step, first, rows, columns):
     """
     result = np.empty((rows, columns), pixels.dtype)
     for r in range(rows):
-        y = (r + first[0]) / step
-        i = int(y)
-        line = nodes[i] + (y - i) * (nodes[i + 1] - nodes[i])
+        line = _line(nodes, (r + first[0]) / step)
         for c in range(columns):
-            x = (c + first[1]) / step
-            j = int(x)
-            x -= j
-            v = line[j, 0] + x * (line[j + 1, 0] - line[j, 0])
-            u = line[j, 1] + x * (line[j + 1, 1] - line[j, 1])
+            v, u = _place(line, (c + first[1]) / step)
             if np.isnan(v + u):
                 result[r, c] = np.nan
                 continue
@@ -80,15 +89,9 @@ def resample_reduced(pixels, origin, nodes, step, first, rows, columns, scale):
     after = math.ceil(2 * scale)
     down, across = np.empty(2 * after), np.empty(2 * after)
     for r in range(rows):
-        y = (r + first[0]) / step
-        i = int(y)
-        line = nodes[i] + (y - i) * (nodes[i + 1] - nodes[i])
+        line = _line(nodes, (r + first[0]) / step)
         for c in range(columns):
-            x = (c + first[1]) / step
-            j = int(x)
-            x -= j
-            v = line[j, 0] + x * (line[j + 1, 0] - line[j, 0])
-            u = line[j, 1] + x * (line[j + 1, 1] - line[j, 1])
+            v, u = _place(line, (c + first[1]) / step)
             if np.isnan(v + u):
                 result[r, c] = np.nan
                 continue

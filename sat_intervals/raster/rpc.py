@@ -22,9 +22,8 @@ def find_model(image: str) -> str | None:
     if not known:
         beside = Path(image).with_suffix(".geom")
         return str(beside) if beside.is_file() else None
-    names = {file: Path(file).name.lower() for file in files}
-    # GDAL lists the RPC_*.XML of DIMAP beside other files of the product
-    own = [file for file, name in names.items() if name.endswith(_BESIDE) or name.startswith("rpc_")]
+    # RPC_*.XML of DIMAP is of the whole product: only GDAL moves it to the tile of the image
+    own = [file for file in files if Path(file).name.lower().endswith(_BESIDE)]
     return own[0] if own else image
 
 

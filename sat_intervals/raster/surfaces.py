@@ -1,6 +1,5 @@
 """Read rasters on the grid of a surface model."""
 
-from math import ceil, floor
 from pathlib import Path
 
 import numpy as np
@@ -84,9 +83,9 @@ def covered_window(path: Path, place: Georeferencing, shape: tuple[int, int]) ->
             return whole
         # only the common part: the whole extent may reach where the CRS of the cells is not defined
         west, south, east, north = transform_bounds(dataset.crs, place.crs, left, bottom, right, top)
-    row, column = floor((north - grid.f) / grid.e), floor((west - grid.c) / grid.a)
-    row_stop, column_stop = ceil((south - grid.f) / grid.e), ceil((east - grid.c) / grid.a)
-    return Window(row, column, row_stop - row, column_stop - column).clipped(whole)
+    first = (north - grid.f) / grid.e, (west - grid.c) / grid.a
+    last = (south - grid.f) / grid.e, (east - grid.c) / grid.a
+    return Window.around(first, last).clipped(whole)
 
 
 def read_heights(
@@ -121,19 +120,16 @@ def window_of_ground(path: Path, bounds: tuple[float, float, float, float], arou
     _, place = read_place(path)
     with opened(str(path)) as dataset:
         west, south, east, north = bounds
-        window = dataset.window(*transform_bounds("EPSG:4326", place.crs, *bounds))
-        if not Window(0, 0, *dataset.shape).clipped(_around(window)) == _around(window):
+
+        def window(beyond: float) -> Window:
+            grown = west - beyond, south - beyond, east + beyond, north + beyond
+            area = dataset.window(*transform_bounds("EPSG:4326", place.crs, *grown))
+            return Window.around(*zip(*area.toranges(), strict=True))
+
+        whole = Window(0, 0, *dataset.shape)
+        if window(0).clipped(whole) != window(0):
             raise SatIntervalsError(
                 f"{path} does not cover the images, at longitudes {west:.4f} to {east:.4f}, latitudes {south:.4f} to "
                 f"{north:.4f}: give a DEM that does"
             )
-        grown = west - around, south - around, east + around, north + around
-        area = dataset.window(*transform_bounds("EPSG:4326", place.crs, *grown))
-        return _around(area).clipped(Window(0, 0, *dataset.shape))
-
-
-def _around(area: RasterioWindow) -> Window:
-    """Return the window of whole pixels around a part of a raster."""
-    first = floor(area.row_off), floor(area.col_off)
-    last = ceil(area.row_off + area.height), ceil(area.col_off + area.width)
-    return Window(*first, last[0] - first[0], last[1] - first[1])
+        return window(around).clipped(whole)

@@ -10,6 +10,9 @@ from sat_intervals.run.quality import rows_left
 from sat_intervals.run.search_range import finder_here
 from sat_intervals.tiling import Window
 
+# Pixels of median row offset up to which rows correspond.
+_AGREE = 0.1
+
 
 def compared_rows(left: Path, right: Path, progress: Progress) -> dict[str, Any]:
     """Return how far rows of a pair differ: ``text``, ``warnings`` (lines), ``search`` (range) and ``survey``."""
@@ -23,10 +26,13 @@ def compared_rows(left: Path, right: Path, progress: Progress) -> dict[str, Any]
         survey = finder.survey(*images, Window(0, 0, images[0].height, images[0].width), search)
     text = "not compared: too few matches"
     if rows := survey.rows:
-        does = "match takes them out" if survey.is_large and not rows.contradiction else "left as they are"
+        is_taken = survey.is_large and not rows.contradiction
+        does = "match takes them out" if is_taken else "match leaves them"
+        left_over = (rows.after if is_taken else rows.before)[0]
+        verdict = f"correspond within {_AGREE:g} px" if left_over <= _AGREE else f"differ by {left_over:.2f} px"
         text = (
             f"offsets of {rows.before[0]:.2f} px in the median, up to {rows.most:.2f} px; {does}; a smooth function "
-            f"leaves {rows.after[0]:.2f} px on other matches"
+            f"leaves {rows.after[0]:.2f} px on other matches: rows {verdict}"
         )
     warnings = rows_left(survey, "auto", str(right))
     return {"text": text, "warnings": warnings, "search": search, "survey": survey.report()}
