@@ -4,6 +4,7 @@ import logging
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.heights.models import SensorImage, common_parts, read_with, shares_at
 from sat_intervals.kernels.compiled import kernels_of_others
-from sat_intervals.raster import Georeferencing, window_of_ground
+from sat_intervals.raster import Georeferencing, ground_of, write_layer
 from sat_intervals.tiling import Window
 
 with kernels_of_others():
@@ -192,9 +193,10 @@ def _dem(left: SensorImage, right: SensorImage, nodes: np.ndarray, terrain: Terr
     """
     dem, geoid = str(terrain.dem), terrain.geoid and str(terrain.geoid)
     ground = left.model.direct_loc_h(*nodes[:: len(nodes) - 1].reshape(-1, 2).T, height)[:, :2]
-    window = window_of_ground(Path(dem), (*ground.min(axis=0), *ground.max(axis=0)), _AROUND)
-    roi = [window.row, window.column, window.row_stop, window.column_stop]
-    read = read_with(Path(dem), "DEM", lambda name: dtm_reader(name, geoid, roi=roi))
+    heights, place = ground_of(Path(dem), (*ground.min(axis=0), *ground.max(axis=0)), _AROUND)
+    with TemporaryDirectory() as folder:  # shareloc takes places of a projected DEM for degrees
+        write_layer(file := Path(folder) / "dem.tif", heights, np.nan, place)
+        read = read_with(file, f"DEM {dem}", lambda name: dtm_reader(name, geoid))
     if not np.isfinite(read.alt_data).all():
         given = f"{dem} with {geoid}" if geoid else dem
         raise SatIntervalsError(f"{given} has no heights at a part of the images: give files that cover them")

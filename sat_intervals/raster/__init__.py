@@ -25,11 +25,11 @@ from sat_intervals.raster.rpc import find_model, read_rpc_file
 from sat_intervals.raster.surfaces import (
     check_reference,
     covered_window,
+    ground_of,
     is_surface,
     read_heights,
     read_place,
     resolution_of,
-    window_of_ground,
 )
 from sat_intervals.raster.windows import Layer, read_small_image, read_small_layers, read_views, read_window
 from sat_intervals.raster.writer import OutputWriter
@@ -67,6 +67,7 @@ __all__ = [
     "footprint",
     "geoid_grid",
     "grid_mapping",
+    "ground_of",
     "halved",
     "horizontal_name",
     "is_surface",
@@ -94,7 +95,6 @@ __all__ = [
     "truth_file",
     "utm_of",
     "warn_of_no_data",
-    "window_of_ground",
     "write_file",
     "write_layer",
 ]

@@ -1,11 +1,13 @@
 """Read rasters on the grid of a surface model."""
 
+from math import ceil, floor
 from pathlib import Path
 
 import numpy as np
 import pyproj
+from rasterio.crs import CRS
 from rasterio.enums import MaskFlags, Resampling
-from rasterio.transform import array_bounds
+from rasterio.transform import Affine, array_bounds
 from rasterio.vrt import WarpedVRT
 from rasterio.warp import calculate_default_transform, transform_bounds
 from rasterio.windows import Window as RasterioWindow
@@ -17,6 +19,8 @@ from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.heightfield import other_unit
 from sat_intervals.raster.images import opened
 from sat_intervals.tiling import Window
+
+Bounds = tuple[float, float, float, float]
 
 
 def is_surface(path: Path) -> bool:
@@ -112,24 +116,31 @@ def read_heights(
         return np.asarray(values * dataset.scales[0] + dataset.offsets[0])
 
 
-def window_of_ground(path: Path, bounds: tuple[float, float, float, float], around: float) -> Window:
-    """Return the window of a raster of heights that covers some ground and what is around it; raise if none does.
+def ground_of(path: Path, bounds: Bounds, around: float) -> tuple[np.ndarray, Georeferencing]:
+    """Return the heights of a raster in any CRS in degrees (EPSG:4326), and their georeferencing; raise if it is short.
 
-    ``bounds``: least longitude and latitude, then the largest ones; ``around``: in degrees too.
+    ``bounds``: least longitude and latitude, then the largest ones, of ground that it must cover; ``around``: degrees
+    more, where unknown heights are the median of the others.
     """
     _, place = read_place(path)
+    degrees = CRS.from_epsg(4326)
+    west, south, east, north = bounds
     with opened(str(path)) as dataset:
-        west, south, east, north = bounds
-
-        def window(beyond: float) -> Window:
-            grown = west - beyond, south - beyond, east + beyond, north + beyond
-            area = dataset.window(*transform_bounds("EPSG:4326", place.crs, *grown))
-            return Window.around(*zip(*area.toranges(), strict=True))
-
-        whole = Window(0, 0, *dataset.shape)
-        if window(0).clipped(whole) != window(0):
-            raise SatIntervalsError(
-                f"{path} does not cover the images, at longitudes {west:.4f} to {east:.4f}, latitudes {south:.4f} to "
-                f"{north:.4f}: give a DEM that does"
-            )
-        return window(around).clipped(whole)
+        area = dataset.window(*transform_bounds("EPSG:4326", place.crs, *bounds))
+        whole, own = Window(0, 0, *dataset.shape), transform_bounds(place.crs, "EPSG:4326", *dataset.bounds)
+    window = Window.around(*zip(*area.toranges(), strict=True))
+    if window.clipped(whole) != window:
+        raise SatIntervalsError(
+            f"{path} does not cover the images, at longitudes {west:.4f} to {east:.4f}, latitudes {south:.4f} to "
+            f"{north:.4f}, but only {own[0]:.4f} to {own[2]:.4f} and {own[1]:.4f} to {own[3]:.4f}: give a larger DEM"
+        )
+    cell = resolution_of(path, Georeferencing(crs=degrees))
+    columns, rows = (ceil((last - first + 2 * around) / cell) for first, last in ((west, east), (south, north)))
+    grid = Georeferencing(crs=degrees, transform=Affine(cell, 0, west - around, 0, -cell, north + around))
+    heights = read_heights(path, grid, (rows, columns), Window(0, 0, rows, columns), smooth=True)
+    margin = floor(around / cell)
+    outside = np.ones(heights.shape, bool)
+    outside[margin : rows - margin, margin : columns - margin] = False
+    known = heights[np.isfinite(heights)]
+    heights[outside & np.isnan(heights)] = np.median(known) if known.size else np.nan
+    return heights, grid

@@ -339,6 +339,28 @@ def test_rectify__a_flat_dem_is_an_altitude(raw, tmp_path):
     refused(["rectify", *raw, tmp_path / "cut", "--dem", dem("cut.tif", 1.451)], "cut.tif does not cover the images")
 
 
+def test_rectify__a_projected_dem_is_as_one_in_degrees(raw, tmp_path):
+    from rasterio.warp import Resampling, calculate_default_transform, reproject
+    from surfaces import write_raster
+
+    from sat_intervals.heights.epipolar import Terrain, epipolar_geometry
+
+    place = Affine(0.0005, 0, 1.42, 0, -0.0005, 43.63)
+    slope = np.broadcast_to(0.2 * np.arange(120.0), (1, 120, 120)).copy()
+    degrees = write_raster(tmp_path / "degrees.tif", slope, place, "EPSG:4326")
+    with rasterio.open(degrees) as file:
+        utm, width, height = calculate_default_transform(file.crs, "EPSG:32631", 120, 120, *file.bounds)
+        warped = np.full((1, height, width), np.nan)
+        reproject(slope, warped, src_transform=place, src_crs=file.crs, dst_transform=utm, dst_crs="EPSG:32631",
+                  dst_nodata=np.nan, resampling=Resampling.bilinear)  # fmt: skip
+    projected = write_raster(tmp_path / "utm.tif", warped, utm, "EPSG:32631")
+    one, other = (
+        epipolar_geometry(*sensor_images(raw[0].parent), Terrain(dem), "coarser") for dem in (degrees, projected)
+    )
+    assert np.ptp(one.right - one.left) > 1
+    assert_allclose(other.right, one.right, rtol=0, atol=0.05)
+
+
 def test_rectify__a_dem_that_just_covers_is_enough_and_bad_ones_are_refused_in_one_line(made, raw, tmp_path):
     from surfaces import write_raster
 
@@ -360,7 +382,6 @@ def test_rectify__a_dem_that_just_covers_is_enough_and_bad_ones_are_refused_in_o
     (tmp_path / "junk.gtx").write_text("junk")
     dem, away = tmp_path / "dem.tif", raster("away.tif", slope, 1e-4, moved=1.0)
     for words, parts in (
-        ((raster("edge.tif", slope, 1e-5),), ["edge.tif does not cover the epipolar images"]),
         ((raster("feet.tif", 400 + slope, 1e-4),), ["feet.tif: median height 4", "-48 to 72 m"]),
         ((raster("empty.tif", np.nan * slope, 1e-4),), ["cannot read", "empty.tif as DEM"]),
         ((dem, "--geoid", away), ["dem.tif with", "away.tif has no heights"]),
