@@ -196,7 +196,7 @@ def _dem(left: SensorImage, right: SensorImage, nodes: np.ndarray, terrain: Terr
     heights, place = ground_of(Path(dem), (*ground.min(axis=0), *ground.max(axis=0)), _AROUND)
     with TemporaryDirectory() as folder:  # shareloc takes places of a projected DEM for degrees
         write_layer(file := Path(folder) / "dem.tif", heights, np.nan, place)
-        read = read_with(file, f"DEM {dem}", lambda name: dtm_reader(name, geoid))
+        read = read_with(Path(dem), "DEM", lambda _: dtm_reader(str(file), geoid))
     if not np.isfinite(read.alt_data).all():
         given = f"{dem} with {geoid}" if geoid else dem
         raise SatIntervalsError(f"{given} has no heights at a part of the images: give files that cover them")

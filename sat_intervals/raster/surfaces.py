@@ -142,5 +142,7 @@ def ground_of(path: Path, bounds: Bounds, around: float) -> tuple[np.ndarray, Ge
     outside = np.ones(heights.shape, bool)
     outside[margin : rows - margin, margin : columns - margin] = False
     known = heights[np.isfinite(heights)]
-    heights[outside & np.isnan(heights)] = np.median(known) if known.size else np.nan
+    if not known.size:
+        raise SatIntervalsError(f"{path} has no heights at the images: give a DEM that has some there")
+    heights[outside & np.isnan(heights)] = np.median(known)
     return heights, grid
