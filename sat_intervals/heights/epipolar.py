@@ -29,12 +29,16 @@ STEP, MARGIN = 30, 2
 _BEYOND = 60
 # Heights that are tried, and the share of the largest overlap that is as good.
 _HEIGHTS, _AS_GOOD = 64, 0.99
+# Share of the largest overlap below which a given altitude is doubted.
+_MUCH = 0.8
 # Ratio of pixel sizes up to which they are equal: the cubic then needs no smoothing.
 _EQUAL = 1.1
 # Base-to-height ratio below which a pixel of disparity is more than 25 m in an image of .5 m.
 _LEAST_BASE = 0.02
 # Degrees of a DEM around the nodes, for ground that is higher or lower.
 _AROUND = 0.02
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -92,6 +96,14 @@ def epipolar_geometry(left: SensorImage, right: SensorImage, terrain: Terrain, r
     for one in (left, right):
         one.check_height(height)
     share, parts = _overlap(left, right, height, f"at {height:.0f} m above the ellipsoid")
+    if terrain.altitude is not None:
+        likely = likely_height(left, right)
+        larger = common_parts(left, right, likely, _BEYOND)[0]
+        if share < _MUCH * larger:
+            _LOG.warning(
+                "at %g m the images overlap by %.0f %%, at %.0f m by %.0f %%: check --altitude",
+                *(height, 100 * share, likely, 100 * larger),
+            )
     sizes = [_pixel_size(one, part, height) for one, part in zip((left, right), parts, strict=True)]
     ratio = sizes[1] / sizes[0]
     spacing = ratio if resolution_of == "coarser" and ratio > _EQUAL else 1.0

@@ -1,6 +1,7 @@
 """Raw pairs to epipolar pairs and surfaces: grids, images, models, and what is refused."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -320,6 +321,15 @@ def test_rectify__takes_the_coarser_pixels(raw, tmp_path):
     assert record["rows"]["survey"]["rows"]["before"][0] < 0.1
     assert invoke("rectify", raw[0], coarse, tmp_path / "left", "--resolution-of", "left").exit_code == 0
     assert json.loads((tmp_path / "left" / "rectify.json").read_text())["pixel_size"] == pytest.approx(0.5, abs=0.005)
+
+
+@pytest.mark.parametrize(("altitude", "doubts"), [(0.0, True), (706.0, False)])
+def test_epipolar_geometry__doubts_an_altitude_that_loses_overlap(shared_data, caplog, altitude, doubts):
+    from sat_intervals.heights.epipolar import Terrain, epipolar_geometry
+
+    images = sensor_images(shared_data / "raw_picanteo_pre")
+    epipolar_geometry(*images, Terrain(altitude=altitude), "coarser")
+    assert bool(re.search(r"at 0 m the images overlap by 4\d %, at 7\d\d m by 9\d %: check", caplog.text)) == doubts
 
 
 def test_rectify__a_flat_dem_is_an_altitude(raw, tmp_path):
