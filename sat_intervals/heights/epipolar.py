@@ -35,6 +35,8 @@ _MUCH = 0.8
 _EQUAL = 1.1
 # Base-to-height ratio below which a pixel of disparity is more than 25 m in an image of .5 m.
 _LEAST_BASE = 0.02
+# Nodes along an image to find the ground under its corners.
+_FEW = 100
 # Degrees of a DEM around the nodes, for ground that is higher or lower.
 _AROUND = 0.02
 
@@ -107,13 +109,15 @@ def epipolar_geometry(left: SensorImage, right: SensorImage, terrain: Terrain, r
     sizes = [_pixel_size(one, part, height) for one, part in zip((left, right), parts, strict=True)]
     ratio = sizes[1] / sizes[0]
     spacing = ratio if resolution_of == "coarser" and ratio > _EQUAL else 1.0
-    nodes, shape, base = shareloc_grids((left, right), parts, height, spacing)
+    elevation: Any = height
     if terrain.dem:
+        step = STEP * max(1, max(parts[0].height, parts[0].width) // (_FEW * STEP))
+        nodes, *_ = shareloc_grids((left, right), parts, height, spacing, step)
         elevation = _dem(left, right, nodes[0], terrain, height)
         share, parts = _overlap(left, right, elevation, f"on {terrain.dem}")
-        nodes, shape, base = shareloc_grids((left, right), parts, elevation, spacing)
-        if not np.isfinite([base, *map(np.sum, nodes)]).all():
-            raise SatIntervalsError(f"{terrain.dem} does not cover the epipolar images: give a larger DEM")
+    nodes, shape, base = shareloc_grids((left, right), parts, elevation, spacing)
+    if not np.isfinite([base, *map(np.sum, nodes)]).all():
+        raise SatIntervalsError(f"{terrain.dem} does not cover the epipolar images: give a larger DEM")
     base_to_height = base * sizes[0]
     if not base_to_height >= _LEAST_BASE:
         raise SatIntervalsError(
@@ -152,7 +156,11 @@ def likely_height(left: SensorImage, right: SensorImage) -> float:
 
 
 def shareloc_grids(
-    images: tuple[SensorImage, SensorImage], parts: tuple[Window, Window], elevation: Any, spacing: float = 1.0
+    images: tuple[SensorImage, SensorImage],
+    parts: tuple[Window, Window],
+    elevation: Any,
+    spacing: float = 1.0,
+    step: int = STEP,
 ) -> tuple[tuple[np.ndarray, np.ndarray], tuple[int, int], float]:
     """Return grids over parts of both images, rows and columns, and pixels of the left image per metre of height."""
     areas = [
@@ -165,12 +173,13 @@ def shareloc_grids(
         )
         for one, part in zip(images, parts, strict=True)
     ]
+    margin = MARGIN * STEP // step  # as many pixels, or fewer
     root = logging.getLogger()  # to which shareloc tells that nodes are NaN
     root.addFilter(_drop)
     try:
         with warnings.catch_warnings(action="ignore"):
             left, right, shape, base = compute_stereorectification_epipolar_grids(
-                areas[0], images[0].model, areas[1], images[1].model, elevation, epi_step=STEP, margin=MARGIN
+                areas[0], images[0].model, areas[1], images[1].model, elevation, epi_step=step, margin=margin
             )
     finally:
         root.removeFilter(_drop)
