@@ -114,6 +114,7 @@ NOT_RUN = {
     "s3://": "tests/store/test_remote.py",
     "LEFT.TIF": "tests/heights/test_rectify.py, with a raw pair made up",
     "pair/left.tif": "likewise",
+    "surface left.tif right.tif out/ --resolution 1": "likewise",
     "dsm run/": "likewise",
     "--tune": "tests/run/test_calibrate.py",
     "lidar.tif": "tests/evaluate/test_dsm.py: there are no heights of others for the demo scene",

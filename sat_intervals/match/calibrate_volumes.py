@@ -8,7 +8,8 @@ import xarray as xr
 
 from sat_intervals.config import Calibration, Config, ConfigError, key_of
 from sat_intervals.match.calibration import calibration_of_parts
-from sat_intervals.match.foreign import open_foreign, unmasked
+from sat_intervals.match.costs import unmasked
+from sat_intervals.match.foreign import open_foreign
 from sat_intervals.match.gauge import Gauge, at_levels, block_numbers, pairs_of
 from sat_intervals.match.measurement import Measured, ladders
 from sat_intervals.match.volumes import Kind, Values, cost_of, flags_of, matched_volume, volume_config

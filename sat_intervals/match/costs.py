@@ -1,6 +1,6 @@
 """Costs of an area for the kernels, and those that the values of another matcher become."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,6 +20,13 @@ class MatchingCost(NamedTuple):
     costs: Costs
     gradients: Gradients | None
     state: np.ndarray
+
+
+def unmasked(values: Any) -> np.ndarray:
+    """Return an array, with NaN under a mask."""
+    if isinstance(values, np.ma.MaskedArray):
+        return np.ma.filled(values.astype(np.result_type(values, np.float32)), np.nan)
+    return np.asarray(values)
 
 
 def integer_costs(

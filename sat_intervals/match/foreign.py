@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 
 from sat_intervals.config import ConfigError
+from sat_intervals.match.costs import unmasked
 
 # Names of dimensions, lower case.
 _DISPARITY, _ROW, _COLUMN = {"disp", "disparity", "disparities", "d"}, {"row", "rows", "y"}, {"col", "column", "x"}
@@ -97,13 +98,6 @@ def open_foreign(volume: Any, disparities: Any, kind: str | None, span: Any) -> 
     labels = xr.DataArray(np.empty(values.shape[:2], np.bool_), coordinates, ("y", "x"))
     ends = _ends(kind, span, attributes.get("cmax"))
     return Foreign(values, _spaced(disparities, values.shape[2]), labels, kind, *ends)
-
-
-def unmasked(values: Any) -> np.ndarray:
-    """Return an array, with NaN under a mask."""
-    if isinstance(values, np.ma.MaskedArray):
-        return np.ma.filled(values.astype(np.result_type(values, np.float32)), np.nan)
-    return np.asarray(values)
 
 
 def _in_order(volume: xr.DataArray) -> tuple[xr.DataArray, Hashable]:

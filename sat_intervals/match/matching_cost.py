@@ -12,8 +12,7 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.correlation import correlate
 from sat_intervals.kernels.cost import Cells, Codes, Costs, between, census, padded_to_lanes, window_state
 from sat_intervals.kernels.penalties import Gradients, Rule
-from sat_intervals.match.costs import MatchingCost, foreign_costs, integer_costs
-from sat_intervals.match.foreign import unmasked
+from sat_intervals.match.costs import MatchingCost, foreign_costs, integer_costs, unmasked
 from sat_intervals.match.mccnn import RADIUS, Network, load_network
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
 from sat_intervals.tiling import View, Views, Window, facing, hull

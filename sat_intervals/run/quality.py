@@ -43,11 +43,10 @@ def quality_of(job: Job, tables: Tables) -> dict[str, Any]:
     read of each side; ``same``, whether both images have the same pixels.
     """
     sides, region = {"left": job.left, "right": job.right}, job.store.grid.region
-    lines = {side: _lines(image, region) for side, image in sides.items()}
-    plain = {side: lines[side] for side, image in sides.items() if is_plain(image)}
+    plain = {side: _lines(image, region, _ROWS) for side, image in sides.items() if is_plain(image)}
     collars = {side: collar for side, (pixels, state) in plain.items() if (collar := _collar(pixels, state))}
     collars |= job.found.collars if job.found else {}
-    (left, _), (right, state) = lines.values()
+    (left, _), (right, state) = (_lines(image, region, 1) for image in sides.values())
     same = left.size > 0 and (state == 0).any() and bool(np.array_equal(left, right))
     noise = job.survey and job.survey.noise
     return {"noise": noise, "collars": collars, "no_data": _no_data(job, tables), "same": same}
@@ -65,10 +64,11 @@ def _no_data(job: Job, tables: Tables) -> dict[str, float]:
     return {side: 1 - usable[side] / read[side] if read[side] else 0.0 for side in ("left", "right")}
 
 
-def _lines(image: Image, region: Window) -> tuple[np.ndarray, np.ndarray]:
-    """Read pixels and states of some rows of a region of an image."""
+def _lines(image: Image, region: Window, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Read pixels and states of rows spread over a region of an image, one alone from its middle."""
     inside = region.clipped(Window(0, 0, image.height, image.width))
-    rows = np.unique(np.linspace(inside.row, inside.row_stop - 1, _ROWS).astype(int))
+    places = np.linspace(inside.row, inside.row_stop - 1, count + 2 * (count == 1))
+    rows = np.unique(places[1:-1] if count == 1 else places).astype(int)
     if inside.width <= 0:
         return np.empty((0, 2)), np.empty((0, 2))
     lines = (read_window(image, Window(int(row), inside.column, 1, inside.width)) for row in rows)

@@ -50,7 +50,7 @@ def calibrated(folder, output, *options):
 
 def begun(said, stage):
     """How often a stage of a command's progress begins."""
-    return sum(line.startswith(f"{stage}: 0/") for line in said.splitlines())
+    return sum(line.startswith(f"{stage}: ") for line in said.splitlines())
 
 
 def settings_with(folder, **interval):

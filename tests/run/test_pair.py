@@ -97,7 +97,7 @@ def test_match_pair__warns_of_images_without_texture(pair, tmp_path, caplog):
     pixels[:, 60:] = 900
     for name in ("left", "right"):
         with rasterio.open(tmp_path / f"{name}.tif", "w", **profile) as file:
-            pixels[0, :9] = 700 + (name == "left")  # else the same image twice
+            pixels[:, 0] = 700 + (name == "left")  # else the same image twice
             file.write(pixels, 1)
     flat = {"disparity": {"minimum": -4, "maximum": 4}}
     counts = match_pair(tmp_path / "left.tif", tmp_path / "right.tif", tmp_path / "out", flat)["counts"]

@@ -174,7 +174,7 @@ def test_page__tells_what_the_run_tells(page):
         ("#validity", "rejected by cross-checking: occlusion"),
         ("#search", "Disparities \u221220 to 10 px, given. Of the valid pixels, 0.0 % are within 1 px of the minimum"),
         ("#search", "5.0 % of its pixels are 0"),
-        ("#search", "left.tif: 5 % of the pixels are exactly 0"),
+        ("#warnings", "left.tif: 5 % of the pixels are exactly 0"),
         ("#tiles", "6 tiles of 27 x 27 pixels"),
         ("#tiles", "5.0 % of the disparities, 10.0 % of the bounds of 100 pixels"),
         ("#evaluation", "high confidence"),
@@ -232,7 +232,7 @@ def test_page__says_of_a_pixel_what_the_files_say(browser, tmp_path):
     path, _ = reported(tmp_path, bands, validity, np.full((9, 11), -3.5))
     words = Page(browser, path).text("#pixel").replace("\u2212", "-")
     figures = "disparity -3.25 px, interval -4.0 to -2.0 px, confidence 0.50, truth -3.50 px"
-    assert words == f"Row 4, column 5: valid, {figures}"
+    assert words == f"Row 4, column 5: valid, high confidence, {figures}"
 
 
 def test_page__layers_change_the_map_and_its_key(page):
