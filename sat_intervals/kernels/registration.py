@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sat_intervals.kernels.compiled import cached
+from sat_intervals.kernels.compiled import cached, part
 from sat_intervals.tiling import Grid, Window
 
 REACH = 48
@@ -34,13 +34,13 @@ _SEARCHED, _LEAST_BLOCKS = 8_000, 4
 _CLIP, _FLOOR = 3.0, 1.0
 # Cells of the shift that must raise the loss: by so many cells, and by so many standard errors.
 _PROBE, _LEAST_RISE, _CLEARLY = 4.0, 0.02, 5.0
-# Standard deviation that interpolation between cells adds, in cells: no spread between blocks shows it. A shift is made
-# from so many deviations on.
-_BETWEEN, _CERTAIN = 0.1, 2.0
+# A shift is made from so many standard deviations on.
+_CERTAIN = 2.0
 # Makes a median of absolute values a standard deviation.
 _NORMAL = 1.4826
-# Cells to either side that slopes are taken from: two estimates whose noise is independent. Steps of the solution.
-_NARROW, _WIDE, _SOLVED = 1, 2, 10
+# Cells to either side that slopes are taken from: the noise of the wide ones, also if it is as wide as three cells, is
+# not that of the narrow ones. Steps of the solution.
+_NARROW, _WIDE, _SOLVED = 1, 6, 10
 _DIRECTIONS = np.array([[1.0, 0.0], [0.0, 1.0], [0.7071, 0.7071], [0.7071, -0.7071]])
 
 
@@ -142,16 +142,60 @@ def slopes(surface, block, x, y, reach):
     return result
 
 
-def sampled(surface: np.ndarray, block: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+@cached
+def interpolated(surface, block, x, y):
+    """Return ``(n, 3)`` heights between cells (bilinear), lowest and highest of the nine cells around; NaN if unknown.
+
+    A point between lowest and highest may be a wall that is moved by a cell; beyond them something has changed.
+    """
+    result = np.full((x.size, 3), np.nan)
+    _, rows, columns = surface.shape
+    for n in range(x.size):
+        i, j = int(np.floor(y[n] + 0.5)), int(np.floor(x[n] + 0.5))
+        if 1 <= i < rows - 1 and 1 <= j < columns - 1:
+            here = surface[block[n]]
+            down, across = y[n] - i, x[n] - j
+            below, beside = i + (1 if down > 0 else -1), j + (1 if across > 0 else -1)
+            down, across = abs(down), abs(across)
+            height = (1 - down) * ((1 - across) * here[i, j] + across * here[i, beside])
+            height += down * ((1 - across) * here[below, j] + across * here[below, beside])
+            around = here[i - 1 : i + 2, j - 1 : j + 2]
+            result[n, 0], result[n, 1], result[n, 2] = height, around.min(), around.max()
+    return result
+
+
+@part
+def rise(here, i, j, near, far):
+    """Return the rise per row between two rows beside a cell, over three columns."""
+    total = 0.0
+    for k in range(j - 1, j + 2):
+        total += here[i + far, k] - here[i + near, k]
+    return total / (3 * (far - near))
+
+
+@part
+def slope_of(here, i, j):
+    """Return the slope down the rows: the median of that at a cell and those of both sides, where they are known."""
+    between, above, below = rise(here, i, j, -1, 1), rise(here, i, j, -3, -1), rise(here, i, j, 1, 3)
+    above = between if np.isnan(above) else above
+    below = between if np.isnan(below) else below
+    return max(min(above, between), min(max(above, between), below))
+
+
+@cached
+def sampled(surface, block, x, y):
     """Return ``(n,)`` heights of the nearest cell and its slope, NaN where unknown.
 
     Interpolation between cells averages their noise: halfway, differences would be smaller than at the true shift.
     """
+    result = np.full(x.size, np.nan)
     _, rows, columns = surface.shape
-    slope = slopes(surface, block, x, y, _WIDE)
-    row, column = (np.floor(place + 0.5) for place in (y, x))
-    nearest = block, np.clip(row, 0, rows - 1).astype(np.int64), np.clip(column, 0, columns - 1).astype(np.int64)
-    return np.asarray(surface[nearest] + slope[:, 0] * (y - row) + slope[:, 1] * (x - column))
+    for n in range(x.size):
+        i, j = int(np.floor(y[n] + 0.5)), int(np.floor(x[n] + 0.5))
+        if 3 <= i < rows - 3 and 3 <= j < columns - 3:
+            here = surface[block[n]]
+            result[n] = here[i, j] + slope_of(here, i, j) * (y[n] - i) + slope_of(here.T, j, i) * (x[n] - j)
+    return result
 
 
 def register(blocks: Blocks | None) -> Registration | None:
@@ -186,33 +230,41 @@ def _differences(blocks: Blocks, shift: np.ndarray) -> np.ndarray:
 def _solved(blocks: Blocks, place: np.ndarray, most: float) -> tuple[np.ndarray, np.ndarray] | None:
     """Solve the horizontal shift from slopes (Nuth and Kaab 2011), from a place near it; also its standard deviation.
 
-    Slopes over one cell weigh the equations of slopes over two: the noise of the one is not that of the other, so noise
-    does not count as slopes of the ground. None if the equations have no solution near the place.
+    Heights between cells make walls count in proportion to what they are off. Wide slopes weigh the equations: the
+    noise of the cells that heights are interpolated from is not in them, else it would count as slopes of the ground
+    and draw the shift to whole cells. None if the equations have no solution near the place.
     """
     start = place
     for _ in range(_SOLVED):
         east, north = blocks.moves * place / blocks.cell
         at = blocks.surface, blocks.block, blocks.x - east, blocks.y + north
-        differences = _differences(blocks, place)
+        height, lowest, highest = interpolated(*at).T
+        differences = blocks.moves * (blocks.height - height)
         differences -= _median(differences)
-        weights, design = (slopes(*at, reach)[:, ::-1] * (-1.0, 1.0) / blocks.cell for reach in (_NARROW, _WIDE))
-        used = (np.abs(differences) <= most) & np.isfinite(weights).all(axis=1)
+        weights, design = (slopes(*at, reach)[:, ::-1] * (-1.0, 1.0) / blocks.cell for reach in (_WIDE, _NARROW))
+        expected = height + blocks.moves * differences
+        used = (expected >= lowest - most) & (expected <= highest + most) & np.isfinite(weights + design).all(axis=1)
         weights, design, differences, block = weights[used], design[used], differences[used], blocks.block[used]
-        weights, design = (values - values.mean(axis=0) for values in (weights, design))
+        weights, design, differences = (values - values.mean(axis=0) for values in (weights, design, differences))
         matrix = weights.T @ design
-        matrix = (matrix + matrix.T) / 2
-        if len(differences) < LEAST or not np.linalg.eigvalsh(matrix)[0] > 0:
+        if len(differences) < LEAST or not np.linalg.eigvalsh(matrix + matrix.T)[0] > 0:
             return None
         move = np.linalg.solve(matrix, weights.T @ differences)
         if np.abs(place + move - start).max() > 3 * blocks.cell:
             return None
         place = place + move
-    scores = np.zeros((len(blocks.surface), 2))
-    np.add.at(scores, block, weights * (differences - design @ move)[:, np.newaxis])
-    count = len(np.unique(block))
-    inverse = np.linalg.inv(matrix)
-    spread = inverse @ (scores.T @ scores) @ inverse * count / max(1, count - 1)
-    return place, np.sqrt(np.diag(spread))
+    return place, _left_out(len(blocks.surface), block, weights, design, differences)
+
+
+def _left_out(count: int, block: np.ndarray, weights: np.ndarray, design: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the standard deviation of the solution, from solutions without one block each (the jackknife)."""
+    matrices, sums = np.zeros((count, 2, 2)), np.zeros((count, 2))
+    np.add.at(matrices, block, weights[:, :, np.newaxis] * design[:, np.newaxis])
+    np.add.at(sums, block, weights * values[:, np.newaxis])
+    known = np.bincount(block, minlength=count) > 0
+    matrices, sums = matrices[known], sums[known]
+    moves = np.linalg.solve(matrices.sum(axis=0) - matrices, (sums.sum(axis=0) - sums)[:, :, np.newaxis])[:, :, 0]
+    return np.asarray(np.sqrt(len(moves) - 1) * moves.std(axis=0))
 
 
 def _thinned(blocks: Blocks) -> Blocks:
@@ -272,15 +324,13 @@ def _with_deviation(blocks: Blocks, place: np.ndarray) -> tuple[np.ndarray, np.n
             return None
     if len(np.unique(blocks.block[np.isfinite(here)])) < _LEAST_BLOCKS:
         return None
-    spreads = [_median(_clipped(blocks, start, np.inf)) for start in (np.zeros(2), place)]
-    # edges of surfaces grow to one side: they move the search, but not the median
-    start = np.zeros(2) if spreads[0] < spreads[1] else place
-    solved = _solved(blocks, start, _CLIP * _NORMAL * min(spreads)) or _solved(blocks, start, most)
+    solved = _solved(blocks, place, _CLIP * _NORMAL * _median(_clipped(blocks, place, np.inf)))
     if solved is None:
         return None
     place, across = solved
     up, deviation = _vertical(blocks, _differences(blocks, place))
-    return np.array([*place, up[2]]), np.array([*np.hypot(across, _BETWEEN * blocks.cell), deviation[2]])
+    leaked = [_median(_differences(blocks, place + move)) - up[2] for move in np.diag(across)]
+    return np.array([*place, up[2]]), np.array([*across, np.linalg.norm([deviation[2], *leaked])])
 
 
 def _mean_of_blocks(blocks: Blocks, values: np.ndarray) -> tuple[float, float]:

@@ -140,19 +140,24 @@ def test_evaluate_surface__has_the_nmad_and_both_le90_of_peers(tmp_path):
 
 
 @pytest.mark.peer("xdem")
-def test_evaluate_surface__moves_the_reference_as_xdem_does(tmp_path):
+@pytest.mark.parametrize("noise", [0.0, 0.5])
+def test_evaluate_surface__moves_the_reference_as_xdem_does(tmp_path, noise):
     import xdem
 
+    random = np.random.default_rng(4)
     row, column = np.indices((150, 160)).astype(np.float64)
     truth = relief(row, column)
+    truth = truth + noise * random.normal(size=truth.shape)
     model = write_surface(tmp_path / "dsm.tif", truth, truth - 0.5, truth + 0.5)
-    reference = write_raster(tmp_path / "reference.tif", [relief(row + 2, column + 3) - 5])
-    ours = evaluate_surface(model, reference)["registration"]["shift"]
+    moved = relief(row + 2, column + 3) - 5
+    reference = write_raster(tmp_path / "reference.tif", [moved + noise * random.normal(size=moved.shape)])
+    ours = evaluate_surface(model, reference)["registration"]
     fit = xdem.coreg.NuthKaab().fit(
         xdem.DEM(str(write_raster(tmp_path / "alone.tif", [truth]))), xdem.DEM(str(reference))
     )
     theirs = [fit.meta["outputs"]["affine"][name] for name in ("shift_x", "shift_y", "shift_z")]
-    np.testing.assert_allclose(ours, theirs, atol=0.1)
+    np.testing.assert_allclose(ours["shift"], theirs, atol=0.1)
+    assert (np.abs(np.subtract(ours["shift"], (3, -2, 5))) <= 3 * np.array(ours["deviation"])).all()
 
 
 def test_evaluate_surface__reference_of_another_grid_and_strips(tmp_path, monkeypatch):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.lib.stride_tricks import sliding_window_view
 
 from sat_intervals.kernels import registration
 from sat_intervals.kernels.registration import LEAST, REACH, Blocks, register, summary
@@ -24,16 +25,33 @@ def town(x, y):
     return np.where(inside, 6 + 7 * np.sin(x // 19 + 2 * (y // 23)) ** 2, 0.0)
 
 
-def blocks_of(heights_at, shift, moves=1, noise=0.0, count=500, number=9, seed=0):
+def mountains(x, y):
+    return 150 * np.sin(x / 60) * np.cos(y / 70) + 40 * np.sin((x + y) / 23)
+
+
+def houses(x, y):
+    """Flat ground with boxes of many sizes, 5 to 14 m high: walls stand anywhere between cells."""
+    column, row = np.floor(x / 11.37), np.floor(y / 13.61)
+    drawn = [np.modf(np.abs(43758.5453 * np.sin(12.9898 * column + 78.233 * row + k)))[0] for k in range(5)]
+    left, top = x - 11.37 * column - 3 * drawn[0], y - 13.61 * row - 4 * drawn[1]
+    inside = (left > 0) & (top > 0) & (left < 3 + 4 * drawn[2]) & (top < 4 + 4 * drawn[3])
+    return np.where(inside, 5 + 9 * drawn[4], 0.0)
+
+
+def blocks_of(heights_at, shift, moves=1, noise=0.0, count=500, number=9, seed=0, aligned=False, wide=1):
+    """Blocks of surfaces and points, anywhere or at centres of cells; noise of the surfaces is as wide as cells."""
     random = np.random.default_rng(seed)
     size = SIDE + 2 * REACH
     column, row = np.meshgrid(np.arange(size), np.arange(size))
     surfaces, parts = [], []
     for index in range(number):
-        left, top = 47.0 * (index % 3), 53.0 * (index // 3)
+        left, top = 47.0 * (index % 3) + 313.7 * seed, 53.0 * (index // 3)
         surface = heights_at(left + column * CELL, top - row * CELL)
-        surfaces.append(surface + noise * random.normal(size=surface.shape))
+        added = sliding_window_view(random.normal(size=(size + wide - 1,) * 2), (wide, wide)).mean(axis=(2, 3))
+        surfaces.append(surface + noise * added / added.std())
         x, y = random.uniform(REACH, REACH + SIDE, (2, count))
+        if aligned:
+            x, y = np.rint(x), np.rint(y)
         east, north = left + x * CELL - moves * shift[0], top - y * CELL - moves * shift[1]
         height = heights_at(east, north) + moves * shift[2]
         parts.append((np.full(count, index), x, y, height + noise * random.normal(size=count)))
@@ -60,19 +78,9 @@ def test_register__states_its_uncertainty():
     assert (ratio > 0.2).all()
 
 
-def aligned(shift, noise, seed):
-    """Blocks whose points are the centres of the surface's cells, before they are moved."""
-    blocks = blocks_of(hills, shift, noise=noise, count=600, seed=seed)
-    random, block = np.random.default_rng(seed), blocks.block
-    x, y = np.rint(blocks.x), np.rint(blocks.y)
-    left, top = 47.0 * (block % 3), 53.0 * (block // 3)
-    height = hills(left + x * CELL - shift[0], top - y * CELL - shift[1]) + shift[2]
-    return blocks._replace(x=x, y=y, height=height + noise * random.normal(size=x.size))
-
-
 def test_register__noise_does_not_move_aligned_surfaces():
     """Nothing is moved, and differences stay as they are: the noise is not averaged away."""
-    found = [register(aligned((0.0, 0.0, 0.0), 0.7, seed)) for seed in range(4)]
+    found = [register(blocks_of(hills, (0.0, 0.0, 0.0), noise=0.7, seed=seed, aligned=True)) for seed in range(4)]
     assert sum((one.shift == 0).all() for one in found) >= 3
     for one in found:
         assert (np.abs(one.shift) <= 3 * one.deviation).all()
@@ -80,19 +88,30 @@ def test_register__noise_does_not_move_aligned_surfaces():
         assert np.std(one.after) == pytest.approx(0.7 * np.sqrt(2), rel=0.05)
 
 
-def test_register__deviations_cover_shifts_of_a_quarter_of_a_cell():
-    """In 9 of 10 trials at .9, under noise of .5 m."""
+@pytest.mark.parametrize("aligned", [True, False])
+@pytest.mark.parametrize("heights_at", [houses, hills, mountains])
+def test_register__deviations_cover_shifts_below_a_cell(heights_at, aligned):
+    """Without bias, and in about 9 of 10 trials at .9, under white noise and noise as wide as three cells."""
     errors, deviations = [], []
-    for seed in range(12):
-        blocks = aligned((CELL / 4, -CELL / 4, 1.0), 0.5, seed)
-        most = registration._most(blocks, np.zeros(2))
-        place, deviation = registration._solved(blocks, np.zeros(2), most)
-        errors.append(place - (CELL / 4, -CELL / 4))
+    for seed in range(16):
+        shift = CELL * np.array([3.7, -3.7] if seed % 2 else [0.25, -0.25])
+        noise = {"noise": 0.5, "wide": (1, 3)[seed // 2 % 2]}
+        blocks = blocks_of(heights_at, (*shift, 1.0), number=16, seed=seed, aligned=aligned, **noise)
+        place, deviation = registration._solved(blocks, CELL * np.rint(shift / CELL), 1.5)
+        errors.append(place - shift)
         deviations.append(deviation)
     inside = np.abs(errors) <= 1.645 * np.array(deviations)
     assert inside.mean() >= 0.75
-    assert np.abs(np.mean(errors, axis=0)).max() < CELL / 8
+    assert np.abs(np.mean(errors, axis=0)).max() < 0.03 * CELL
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.sqrt(np.mean(np.square(deviations))), rel=0.5)
+
+
+@pytest.mark.parametrize("aligned", [True, False])
+def test_register__noise_stays_as_it_is_in_towns(aligned):
+    """Walls are no noise, and the whole shift is found."""
+    found = register(blocks_of(houses, (1.85, -1.85, 1.0), noise=0.1, number=16, aligned=aligned))
+    np.testing.assert_allclose(found.shift, (1.85, -1.85, 1.0), atol=0.06)
+    assert summary(found.after)["nmad"] == pytest.approx(0.1 * np.sqrt(2), rel=0.1)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.3])
