@@ -39,8 +39,9 @@ _CERTAIN = 2.0
 # Makes a median of absolute values a standard deviation.
 _NORMAL = 1.4826
 # Cells to either side that slopes are taken from: the noise of the wide ones, also if it is as wide as three cells, is
-# not that of the narrow ones. Steps of the solution.
-_NARROW, _WIDE, _SOLVED = 1, 6, 10
+# not that of the narrow ones. Houses are narrower than the widest: the first that leave less than so many cells of
+# deviation are taken. Steps of the solution.
+_NARROW, _WIDE, _SURE, _SOLVED = 1, (6, 4, 2), 0.3, 10
 _DIRECTIONS = np.array([[1.0, 0.0], [0.0, 1.0], [0.7071, 0.7071], [0.7071, -0.7071]])
 
 
@@ -227,7 +228,7 @@ def _differences(blocks: Blocks, shift: np.ndarray) -> np.ndarray:
     return np.asarray(blocks.moves * (blocks.height - height))
 
 
-def _solved(blocks: Blocks, place: np.ndarray, most: float) -> tuple[np.ndarray, np.ndarray] | None:
+def _solved(blocks: Blocks, place: np.ndarray, most: float, wide: int) -> tuple[np.ndarray, np.ndarray] | None:
     """Solve the horizontal shift from slopes (Nuth and Kaab 2011), from a place near it; also its standard deviation.
 
     Heights between cells make walls count in proportion to what they are off. Wide slopes weigh the equations: the
@@ -241,7 +242,7 @@ def _solved(blocks: Blocks, place: np.ndarray, most: float) -> tuple[np.ndarray,
         height, lowest, highest = interpolated(*at).T
         differences = blocks.moves * (blocks.height - height)
         differences -= _median(differences)
-        weights, design = (slopes(*at, reach)[:, ::-1] * (-1.0, 1.0) / blocks.cell for reach in (_WIDE, _NARROW))
+        weights, design = (slopes(*at, reach)[:, ::-1] * (-1.0, 1.0) / blocks.cell for reach in (wide, _NARROW))
         expected = height + blocks.moves * differences
         used = (expected >= lowest - most) & (expected <= highest + most) & np.isfinite(weights + design).all(axis=1)
         weights, design, differences, block = weights[used], design[used], differences[used], blocks.block[used]
@@ -324,10 +325,11 @@ def _with_deviation(blocks: Blocks, place: np.ndarray) -> tuple[np.ndarray, np.n
             return None
     if len(np.unique(blocks.block[np.isfinite(here)])) < _LEAST_BLOCKS:
         return None
-    solved = _solved(blocks, place, _CLIP * _NORMAL * _median(_clipped(blocks, place, np.inf)))
-    if solved is None:
+    most = _CLIP * _NORMAL * _median(_clipped(blocks, place, np.inf))
+    solved = [found for wide in _WIDE if (found := _solved(blocks, place, most, wide)) is not None]
+    if not solved:
         return None
-    place, across = solved
+    place, across = next((found for found in solved if found[1].max() < _SURE * blocks.cell), solved[0])
     up, deviation = _vertical(blocks, _differences(blocks, place))
     leaked = [_median(_differences(blocks, place + move)) - up[2] for move in np.diag(across)]
     return np.array([*place, up[2]]), np.array([*across, np.linalg.norm([deviation[2], *leaked])])

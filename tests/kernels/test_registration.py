@@ -97,7 +97,7 @@ def test_register__deviations_cover_shifts_below_a_cell(heights_at, aligned):
         shift = CELL * np.array([3.7, -3.7] if seed % 2 else [0.25, -0.25])
         noise = {"noise": 0.5, "wide": (1, 3)[seed // 2 % 2]}
         blocks = blocks_of(heights_at, (*shift, 1.0), number=16, seed=seed, aligned=aligned, **noise)
-        place, deviation = registration._solved(blocks, CELL * np.rint(shift / CELL), 1.5)
+        place, deviation = registration._solved(blocks, CELL * np.rint(shift / CELL), 1.5, 6)
         errors.append(place - shift)
         deviations.append(deviation)
     inside = np.abs(errors) <= 1.645 * np.array(deviations)
@@ -107,9 +107,11 @@ def test_register__deviations_cover_shifts_below_a_cell(heights_at, aligned):
 
 
 @pytest.mark.parametrize("aligned", [True, False])
-def test_register__noise_stays_as_it_is_in_towns(aligned):
-    """Walls are no noise, and the whole shift is found."""
-    found = register(blocks_of(houses, (1.85, -1.85, 1.0), noise=0.1, number=16, aligned=aligned))
+@pytest.mark.parametrize("cells", [1, 2])
+def test_register__noise_stays_as_it_is_in_towns(aligned, cells):
+    """Walls are no noise, and the whole shift is found, also where houses are few cells wide."""
+    blocks = blocks_of(lambda x, y: houses(cells * x, cells * y), (1.85, -1.85, 1.0), 1, 0.1, 500, 16, aligned=aligned)
+    found = register(blocks)
     np.testing.assert_allclose(found.shift, (1.85, -1.85, 1.0), atol=0.06)
     assert summary(found.after)["nmad"] == pytest.approx(0.1 * np.sqrt(2), rel=0.1)
 
