@@ -36,6 +36,7 @@ def match(
     rerun the same command.
     """  # noqa: D301 (click's mark of a preformatted paragraph)
     from sat_intervals.cli.console import Console
+    from sat_intervals.cli.logs import warn
 
     config = settings.load()
     if dry_run:
@@ -50,4 +51,6 @@ def match(
     if as_json:
         say_json(report)
     console.summary(report, out, then="report")
+    if out.resolve() in (Path(image).resolve().parent for image in pair.images):
+        warn([f"{out} is the folder of the images: one of its own keeps them apart"])
     run.check_strict(report["warnings"])

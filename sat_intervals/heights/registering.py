@@ -15,9 +15,9 @@ from sat_intervals.kernels.registration import (
     block_side,
     every_nth,
     put_together,
-    sampled,
     spread_blocks,
 )
+from sat_intervals.kernels.relief import sampled
 from sat_intervals.kernels.splat import mean_heights
 from sat_intervals.raster import HeightRaster, Projection
 from sat_intervals.results import Run

@@ -5,6 +5,7 @@ import logging
 import os
 import pty
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -587,6 +588,13 @@ def test_match__prints_plain_lines_and_a_table(done):
     for cause in ("no data or border", "occlusion", "mismatch", "low confidence, of valid pixels"):
         assert re.search(rf"^ *{cause} +\d+\.\d %$", result.stdout, re.MULTILINE)
     assert re.search(r"^time +\d+\.\d s$", result.stdout, re.MULTILINE)
+
+
+def test_match__warns_of_results_among_the_images(folder, tmp_path):
+    here = shutil.copytree(folder, tmp_path / "here")
+    result = invoke(*matching(here, here, "--quiet", "--overwrite"))
+    assert result.exit_code == 0
+    assert result.stderr == f"warning: {here} is the folder of the images: one of its own keeps them apart\n"
 
 
 @pytest.mark.process
