@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 from helpers import COMMAND, invoke
 
 from sat_intervals.cli import main
@@ -185,7 +186,7 @@ def test_commands__of_all_documents_run(place: Path) -> None:
 
 
 @pytest.mark.process
-@pytest.mark.peer("pandora")
+@pytest.mark.peer("pandora", "xdem", "shareloc")
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 def test_code__of_all_documents_runs(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(place)
@@ -197,9 +198,22 @@ def test_code__of_all_documents_runs(place: Path, monkeypatch: pytest.MonkeyPatc
             assert invoke("match", "left.tif", "right.tif", "out", "--disparity", -12, 40).exit_code == 0
             if "match_pair" in code:
                 shutil.rmtree(place / "out")
+            if "lidar.tif" in code:
+                assert invoke("dsm", "out", "--resolution", 1, *shlex.split(in_documents(SENSORS))).exit_code == 0
+                _write_lidar(place)
             exec(code.replace("profile(640)", "profile(64)"), names | {"np": np})
             count += 1
     assert count >= 2
+
+
+def _write_lidar(place: Path) -> None:
+    """Write heights whose distances from the surface are as wide as its intervals."""
+    random = np.random.default_rng(0)
+    with rasterio.open(place / "out" / "dsm.tif") as surface:
+        height, lower, upper = surface.read([1, 2, 3])
+        lidar = height + (upper - lower) / 2 * random.uniform(-1, 1, height.shape)
+        with rasterio.open(place / "lidar.tif", "w", **surface.profile | {"count": 1}) as file:
+            file.write(lidar.astype(np.float32), 1)
 
 
 def test_site__has_a_page_for_every_document_and_every_setting() -> None:
