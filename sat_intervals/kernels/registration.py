@@ -37,9 +37,10 @@ _CERTAIN = 2.0
 # Makes a median of absolute values a standard deviation.
 _NORMAL = 1.4826
 # Cells to either side that slopes are taken from: the noise of the wide ones, also if it is as wide as three cells, is
-# not that of the narrow ones. Houses are narrower than the widest: the first that leave less than so many cells of
-# deviation are taken. Steps of the solution.
-_NARROW, _WIDE, _SURE, _SOLVED = 1, (6, 4, 2), 0.3, 10
+# not that of the narrow ones, but houses are narrower than the widest. Steps of the solution.
+_NARROW, _WIDE, _SOLVED = 1, (6, 4, 2), 10
+# Cells of standard deviation: the first solution below is taken.
+_SURE = 0.3
 _DIRECTIONS = np.array([[1.0, 0.0], [0.0, 1.0], [0.7071, 0.7071], [0.7071, -0.7071]])
 
 
@@ -150,23 +151,30 @@ def _differences(blocks: Blocks, shift: np.ndarray) -> np.ndarray:
     return np.asarray(blocks.moves * (blocks.height - height))
 
 
-def _solved(blocks: Blocks, place: np.ndarray, most: float, wide: int) -> tuple[np.ndarray, np.ndarray] | None:
+def _solved(
+    blocks: Blocks, place: np.ndarray, most: float, wide: int, *, walls: bool
+) -> tuple[np.ndarray, np.ndarray] | None:
     """Solve the horizontal shift from slopes (Nuth and Kaab 2011), from a place near it; also its standard deviation.
 
-    Heights between cells make walls count in proportion to what they are off. Wide slopes weigh the equations: the
-    noise of the cells that heights are interpolated from is not in them, else it would count as slopes of the ground
-    and draw the shift to whole cells. None if the equations have no solution near the place.
+    Wide slopes weigh the equations: the noise of the cells that heights are interpolated from is not in them, else it
+    would count as slopes of the ground and draw the shift to whole cells. With ``walls``, all cells count that may be
+    walls moved by a cell: between cells, they count in proportion to the shift. Without, only ground that is about
+    plane: surfaces of stereo have walls that are moved to one side. None if there is no solution near the place.
     """
     start = place
     for _ in range(_SOLVED):
         east, north = blocks.moves * place / blocks.cell
         at = blocks.surface, blocks.block, blocks.x - east, blocks.y + north
-        height, lowest, highest = interpolated(*at).T
+        height, lowest, highest, bend = interpolated(*at).T
         differences = blocks.moves * (blocks.height - height)
         differences -= _median(differences)
         weights, design = (slopes(*at, reach)[:, ::-1] * (-1.0, 1.0) / blocks.cell for reach in (wide, _NARROW))
-        expected = height + blocks.moves * differences
-        used = (expected >= lowest - most) & (expected <= highest + most) & np.isfinite(weights + design).all(axis=1)
+        if walls:
+            expected = height + blocks.moves * differences
+            used = (expected >= lowest - most) & (expected <= highest + most)
+        else:
+            used = (bend <= most) & (np.abs(differences) <= most)
+        used &= np.isfinite(weights + design).all(axis=1)
         weights, design, differences, block = weights[used], design[used], differences[used], blocks.block[used]
         weights, design, differences = (values - values.mean(axis=0) for values in (weights, design, differences))
         matrix = weights.T @ design
@@ -248,10 +256,11 @@ def _with_deviation(blocks: Blocks, place: np.ndarray) -> tuple[np.ndarray, np.n
     if len(np.unique(blocks.block[np.isfinite(here)])) < _LEAST_BLOCKS:
         return None
     most = _CLIP * _NORMAL * _median(_clipped(blocks, place, np.inf))
-    solved = [found for wide in _WIDE if (found := _solved(blocks, place, most, wide)) is not None]
-    if not solved:
+    tried = (_solved(blocks, place, most, wide, walls=walls) for walls in (False, True) for wide in _WIDE)
+    solved = next((found for found in tried if found is not None and found[1].max() < _SURE * blocks.cell), None)
+    if solved is None:
         return None
-    place, across = next((found for found in solved if found[1].max() < _SURE * blocks.cell), solved[0])
+    place, across = solved
     up, deviation = _vertical(blocks, _differences(blocks, place))
     leaked = [_median(_differences(blocks, place + move)) - up[2] for move in np.diag(across)]
     return np.array([*place, up[2]]), np.array([*across, np.linalg.norm([deviation[2], *leaked])])

@@ -31,13 +31,20 @@ def slopes(surface, block, x, y, reach):
     return result
 
 
+@part
+def bend(here, i, j, down, across):
+    """Return how far a cell is from the middle between two opposite neighbours, twice."""
+    return abs(here[i - down, j - across] + here[i + down, j + across] - 2 * here[i, j])
+
+
 @cached
 def interpolated(surface, block, x, y):
-    """Return ``(n, 3)`` heights between cells (bilinear), lowest and highest of the nine cells around; NaN if unknown.
+    """Return ``(n, 4)`` heights between cells (bilinear), lowest and highest of the nine cells around, and their bend.
 
-    A point between lowest and highest may be a wall that is moved by a cell; beyond them something has changed.
+    Between lowest and highest, a point may be a wall that is moved by a cell; beyond them something has changed. Bends
+    are twice the largest distance from a plane. NaN where unknown.
     """
-    result = np.full((x.size, 3), np.nan)
+    result = np.full((x.size, 4), np.nan)
     _, rows, columns = surface.shape
     for n in range(x.size):
         i, j = int(np.floor(y[n] + 0.5)), int(np.floor(x[n] + 0.5))
@@ -46,10 +53,12 @@ def interpolated(surface, block, x, y):
             down, across = y[n] - i, x[n] - j
             below, beside = i + (1 if down > 0 else -1), j + (1 if across > 0 else -1)
             down, across = abs(down), abs(across)
-            height = (1 - down) * ((1 - across) * here[i, j] + across * here[i, beside])
-            height += down * ((1 - across) * here[below, j] + across * here[below, beside])
+            result[n, 0] = (1 - down) * ((1 - across) * here[i, j] + across * here[i, beside])
+            result[n, 0] += down * ((1 - across) * here[below, j] + across * here[below, beside])
             around = here[i - 1 : i + 2, j - 1 : j + 2]
-            result[n, 0], result[n, 1], result[n, 2] = height, around.min(), around.max()
+            result[n, 1], result[n, 2] = around.min(), around.max()
+            bends = bend(here, i, j, 0, 1), bend(here, i, j, 1, 0), bend(here, i, j, 1, 1), bend(here, i, j, 1, -1)
+            result[n, 3] = max(bends)
     return result
 
 
