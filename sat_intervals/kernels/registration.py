@@ -39,8 +39,8 @@ _NORMAL = 1.4826
 # Cells to either side that slopes are taken from: the noise of the wide ones, also if it is as wide as three cells, is
 # not that of the narrow ones, but houses are narrower than the widest. Steps of the solution.
 _NARROW, _WIDE, _SOLVED = 1, (6, 4, 2), 10
-# Cells of standard deviation: the first solution below is taken.
-_SURE = 0.3
+# Cells of standard deviation: the first solution below is taken; interpolation between cells adds, and no spread shows.
+_SURE, _BETWEEN = 0.3, 0.01
 _DIRECTIONS = np.array([[1.0, 0.0], [0.0, 1.0], [0.7071, 0.7071], [0.7071, -0.7071]])
 
 
@@ -175,10 +175,12 @@ def _solved(
         else:
             used = (bend <= most) & (np.abs(differences) <= most)
         used &= np.isfinite(weights + design).all(axis=1)
+        if used.sum() < LEAST:
+            return None
         weights, design, differences, block = weights[used], design[used], differences[used], blocks.block[used]
         weights, design, differences = (values - values.mean(axis=0) for values in (weights, design, differences))
         matrix = weights.T @ design
-        if len(differences) < LEAST or not np.linalg.eigvalsh(matrix + matrix.T)[0] > 0:
+        if not np.linalg.eigvalsh(matrix + matrix.T)[0] > 0:
             return None
         move = np.linalg.solve(matrix, weights.T @ differences)
         if np.abs(place + move - start).max() > 3 * blocks.cell:
@@ -260,7 +262,7 @@ def _with_deviation(blocks: Blocks, place: np.ndarray) -> tuple[np.ndarray, np.n
     solved = next((found for found in tried if found is not None and found[1].max() < _SURE * blocks.cell), None)
     if solved is None:
         return None
-    place, across = solved
+    place, across = solved[0], np.hypot(solved[1], _BETWEEN * blocks.cell)
     up, deviation = _vertical(blocks, _differences(blocks, place))
     leaked = [_median(_differences(blocks, place + move)) - up[2] for move in np.diag(across)]
     return np.array([*place, up[2]]), np.array([*across, np.linalg.norm([deviation[2], *leaked])])
