@@ -44,6 +44,8 @@ def match(
 
         click.echo(job_script(config.cluster, out))
         return
+    if out.resolve() in (Path(image).parent.resolve() for image in pair.images):
+        warn([f"{out} also holds the images: write to another folder"])
     with Console(run.quiet or as_json) as console:
         settings.check_kept(out)
         left, right = pair.open()
@@ -51,6 +53,4 @@ def match(
     if as_json:
         say_json(report)
     console.summary(report, out, then="report")
-    if out.resolve() in (Path(image).resolve().parent for image in pair.images):
-        warn([f"{out} is the folder of the images: one of its own keeps them apart"])
     run.check_strict(report["warnings"])

@@ -10,6 +10,7 @@ import numpy as np
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.accuracy import LARGEST, Heights
 from sat_intervals.kernels.registration import REACH, every_nth, put_together, register, spread_blocks
+from sat_intervals.kernels.relief import sampled
 from sat_intervals.raster import (
     GROUND,
     Georeferencing,
@@ -26,8 +27,8 @@ from sat_intervals.tiling import Grid, Window
 
 # Heights compared at a time, some hundred bytes each.
 _TILE = 1 << 20
-# Smallest side of the blocks that register, in cells.
-_SMALLEST = 16
+# Smallest side of the blocks that register, in cells; cells around a window that slopes are taken from.
+_SMALLEST, _AROUND = 16, 4
 
 
 @dataclass(frozen=True)
@@ -63,13 +64,16 @@ class Comparison:
     def heights(
         self, place: Georeferencing, shape: tuple[int, int], *, smooth: bool = False, needed: np.ndarray | None = None
     ) -> np.ndarray:
-        """Read the moved reference at the centres of ``shape`` cells; if ``smooth`` or moved sideways, interpolate.
+        """Read the moved reference at the centres of ``shape`` cells; if ``smooth``, interpolate.
 
         Heights that no ground has are NaN, and errors where they are ``needed``: undeclared no data, or another unit.
         """
         east, north, up = self.shift
-        cells, whole, is_between = place.moved(-east, -north), Window(0, 0, *shape), (east, north) != (0.0, 0.0)
-        heights = read_heights(self.reference, cells, shape, whole, smooth=smooth or is_between)
+        cells, whole = place.moved(-east, -north), Window(0, 0, *shape)
+        if smooth or (east, north) == (0.0, 0.0):
+            heights = read_heights(self.reference, cells, shape, whole, smooth=smooth)
+        else:
+            heights = self._moved(place, shape, east, north)
         wrong = (heights < GROUND[0]) | (heights > GROUND[1])
         if needed is not None and (found := heights[wrong & needed]).size:
             raise SatIntervalsError(
@@ -77,6 +81,18 @@ class Comparison:
                 "with gdal_edit.py -a_nodata, or convert the file to metres"
             )
         return np.where(wrong, np.nan, heights + up)
+
+    def _moved(self, place: Georeferencing, shape: tuple[int, int], east: float, north: float) -> np.ndarray:
+        """Read the reference moved by whole cells and, by slopes, the rest: interpolation would average noise away."""
+        assert place.pixel_size is not None
+        cell, rows, columns = place.pixel_size[0], shape[0] + 2 * _AROUND, shape[1] + 2 * _AROUND
+        across, down = round(east / cell), round(-north / cell)
+        cells = place.shifted(Window(-_AROUND - down, -_AROUND - across, *shape))
+        read = read_heights(self.reference, cells, (rows, columns), Window(0, 0, rows, columns))
+        x, y = np.meshgrid(np.arange(shape[1]) - east / cell + across, np.arange(shape[0]) + north / cell + down)
+        block = np.zeros(x.size, np.int64)
+        found: np.ndarray = sampled(read[np.newaxis], block, x.ravel() + _AROUND, y.ravel() + _AROUND)
+        return found.reshape(shape)
 
 
 def open_comparison(

@@ -31,14 +31,14 @@ _SEARCHED, _LEAST_BLOCKS = 8_000, 4
 # Differences count up to this many standard deviations, and those to this many cells at least.
 _CLIP, _FLOOR = 3.0, 1.0
 # Cells of the shift that must raise the loss: by so many cells, and by so many standard errors.
-_PROBE, _LEAST_RISE, _CLEARLY = 4.0, 0.02, 5.0
+_PROBE, _LEAST_RISE, _CLEARLY = 4.0, 0.02, 3.0
 # A shift is made from so many standard deviations on.
 _CERTAIN = 2.0
 # Makes a median of absolute values a standard deviation.
 _NORMAL = 1.4826
-# Cells to either side that slopes are taken from: the noise of the wide ones, also if it is as wide as three cells, is
-# not that of the narrow ones, but houses are narrower than the widest. Steps of the solution.
-_NARROW, _WIDE, _SOLVED = 1, (6, 4, 2), 10
+# Cells to either side that slopes are taken from, and whether walls count, in the order of trial: the noise of slopes
+# over 6 or 4 cells is not that of the narrow ones, also if it is as wide as three cells; houses may be narrower.
+_NARROW, _WIDE, _SOLVED = 1, ((6, False), (4, False), (6, True), (4, True), (2, True)), 10
 # Cells of standard deviation: the first solution below is taken; interpolation between cells adds, and no spread shows.
 _SURE, _BETWEEN = 0.3, 0.01
 _DIRECTIONS = np.array([[1.0, 0.0], [0.0, 1.0], [0.7071, 0.7071], [0.7071, -0.7071]])
@@ -114,7 +114,7 @@ class Registration(NamedTuple):
         """Return plain values, None for a deviation that is unknown; `summary` of differences before and after."""
         return {
             "shift": self.shift.tolist(),
-            "deviation": [None if np.isnan(value) else float(value) for value in self.deviation],
+            "deviation": [float(value) if np.isfinite(value) else None for value in self.deviation],
             "is_horizontal": self.is_horizontal,
             "used": self.used,
             "before": summary(self.before),
@@ -186,17 +186,22 @@ def _solved(
         if np.abs(place + move - start).max() > 3 * blocks.cell:
             return None
         place = place + move
-    return place, _left_out(len(blocks.surface), block, weights, design, differences)
+    return place, _left_out(block, weights, design, differences)
 
 
-def _left_out(count: int, block: np.ndarray, weights: np.ndarray, design: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the standard deviation of the solution, from solutions without one block each (the jackknife)."""
-    matrices, sums = np.zeros((count, 2, 2)), np.zeros((count, 2))
+def _left_out(block: np.ndarray, weights: np.ndarray, design: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the standard deviation of the solution, from solutions without one block each (the jackknife).
+
+    Infinite where too few blocks are left, or one decides alone.
+    """
+    numbers, block = np.unique(block, return_inverse=True)
+    matrices, sums = np.zeros((len(numbers), 2, 2)), np.zeros((len(numbers), 2))
     np.add.at(matrices, block, weights[:, :, np.newaxis] * design[:, np.newaxis])
     np.add.at(sums, block, weights * values[:, np.newaxis])
-    known = np.bincount(block, minlength=count) > 0
-    matrices, sums = matrices[known], sums[known]
-    moves = np.linalg.solve(matrices.sum(axis=0) - matrices, (sums.sum(axis=0) - sums)[:, :, np.newaxis])[:, :, 0]
+    rest = matrices.sum(axis=0) - matrices
+    if len(numbers) < _LEAST_BLOCKS or not (np.linalg.eigvalsh(rest + rest.transpose(0, 2, 1)) > 0).all():
+        return np.full(2, np.inf)
+    moves = np.linalg.solve(rest, (sums.sum(axis=0) - sums)[:, :, np.newaxis])[:, :, 0]
     return np.asarray(np.sqrt(len(moves) - 1) * moves.std(axis=0))
 
 
@@ -255,10 +260,8 @@ def _with_deviation(blocks: Blocks, place: np.ndarray) -> tuple[np.ndarray, np.n
         rise, error = _mean_of_blocks(blocks, before + after - 2 * here)
         if not rise > max(_CLEARLY * error, _LEAST_RISE * blocks.cell):
             return None
-    if len(np.unique(blocks.block[np.isfinite(here)])) < _LEAST_BLOCKS:
-        return None
     most = _CLIP * _NORMAL * _median(_clipped(blocks, place, np.inf))
-    tried = (_solved(blocks, place, most, wide, walls=walls) for walls in (False, True) for wide in _WIDE)
+    tried = (_solved(blocks, place, most, wide, walls=walls) for wide, walls in _WIDE)
     solved = next((found for found in tried if found is not None and found[1].max() < _SURE * blocks.cell), None)
     if solved is None:
         return None

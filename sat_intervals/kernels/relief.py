@@ -77,6 +77,8 @@ def slope_of(here, i, j):
     between, above, below = rise(here, i, j, -1, 1), rise(here, i, j, -3, -1), rise(here, i, j, 1, 3)
     above = between if np.isnan(above) else above
     below = between if np.isnan(below) else below
+    if np.isnan(between):
+        return between
     return max(min(above, between), min(max(above, between), below))
 
 

@@ -594,7 +594,7 @@ def test_match__warns_of_results_among_the_images(folder, tmp_path):
     here = shutil.copytree(folder, tmp_path / "here")
     result = invoke(*matching(here, here, "--quiet", "--overwrite"))
     assert result.exit_code == 0
-    assert result.stderr == f"warning: {here} is the folder of the images: one of its own keeps them apart\n"
+    assert result.stderr == f"warning: {here} also holds the images: write to another folder\n"
 
 
 @pytest.mark.process

@@ -139,6 +139,19 @@ def test_evaluate_surface__has_the_nmad_and_both_le90_of_peers(tmp_path):
     assert ours["rmse"] == pytest.approx(float(np.sqrt(np.mean(np.square(values, dtype=np.float64)))), rel=1e-4)
 
 
+def test_evaluate_surface__half_a_cell_of_shift_averages_no_noise_away(tmp_path):
+    random = np.random.default_rng(4)
+    row, column = np.indices((150, 160)).astype(np.float64)
+    truth, moved = (
+        heights + 0.5 * random.normal(size=row.shape)
+        for heights in (relief(row, column), relief(row + 2.5, column + 2.5))
+    )
+    model = write_surface(tmp_path / "dsm.tif", truth, truth - 0.5, truth + 0.5)
+    found = evaluate_surface(model, write_raster(tmp_path / "reference.tif", [moved]))
+    np.testing.assert_allclose(found["registration"]["shift"][:2], (2.5, -2.5), atol=0.1)
+    assert found["all"]["nmad"] == pytest.approx(0.5 * np.sqrt(2), rel=0.05)
+
+
 @pytest.mark.peer("xdem")
 @pytest.mark.parametrize("noise", [0.0, 0.5])
 def test_evaluate_surface__moves_the_reference_as_xdem_does(tmp_path, noise):

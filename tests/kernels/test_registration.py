@@ -97,11 +97,9 @@ def test_register__deviations_cover_shifts_below_a_cell(heights_at, aligned):
         shift = CELL * np.array([3.7, -3.7] if seed % 2 else [0.25, -0.25])
         noise = {"noise": 0.5, "wide": (1, 3)[seed // 2 % 2]}
         blocks = blocks_of(heights_at, (*shift, 1.0), number=16, seed=seed, aligned=aligned, **noise)
-        place, deviation = registration._solved(
-            blocks, CELL * np.rint(shift / CELL), 1.5, 6, walls=heights_at is houses
-        )
-        errors.append(place - shift)
-        deviations.append(deviation)
+        found, deviation = registration._with_deviation(blocks, CELL * np.rint(shift / CELL))
+        errors.append(found[:2] - shift)
+        deviations.append(deviation[:2])
     inside = np.abs(errors) <= 1.645 * np.array(deviations)
     assert inside.mean() >= 0.75
     assert np.abs(np.mean(errors, axis=0)).max() < 0.05 * CELL
@@ -116,6 +114,23 @@ def test_register__noise_stays_as_it_is_in_towns(aligned, cells):
     found = register(blocks)
     np.testing.assert_allclose(found.shift, (1.85, -1.85, 1.0), atol=0.06)
     assert summary(found.after)["nmad"] == pytest.approx(0.1 * np.sqrt(2), rel=0.1)
+
+
+def test_register__walls_to_one_side_move_nothing_where_the_ground_has_relief():
+    """Surfaces of stereo have walls a cell too far to one side."""
+    blocks = blocks_of(lambda x, y: hills(x, y) + houses(x, y), (0.0, 0.0, 0.0), noise=0.1, number=16)
+    grown = np.maximum(blocks.surface, np.roll(blocks.surface, -1, axis=2))
+    wall = grown - blocks.surface > 2
+    found = register(blocks._replace(surface=np.where(wall, grown, blocks.surface)))
+    assert np.abs(found.shift[:2]).max() < 0.1 * CELL
+
+
+def test_register__known_heights_in_one_block_and_strips_are_too_few():
+    blocks = blocks_of(hills, (0.5, 0.0, 1.0))
+    surface = blocks.surface.copy()
+    surface[1:, :, np.arange(surface.shape[2]) % 24 >= 12] = np.nan
+    found = register(blocks._replace(surface=surface))
+    np.testing.assert_allclose(found.shift, (0.5, 0, 1), atol=0.05)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.3])
