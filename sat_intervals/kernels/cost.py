@@ -26,7 +26,7 @@ from sat_intervals.tiling import Window
 class Codes(NamedTuple):
     """Census codes of a patch.
 
-    words: ``(words, rows, columns)``, uint32 (windows 3 and 5) or uint64 (one word up to window 7, two above).
+    words: ``(words, rows, columns)``, uint32 (one word up to window 5, two for 7), or two of uint64 above.
     state: ``(rows, columns)`` uint8: the union of the states of the window's pixels, 0 = usable.
     """
 
@@ -142,7 +142,7 @@ def census(pixels: np.ndarray, state: np.ndarray, window: int) -> Codes:
     radius = window // 2
     shape = pixels.shape[0] - 2 * radius, pixels.shape[1] - 2 * radius
     neighbours = window**2 - 1
-    dtype = np.uint32 if neighbours <= 32 else np.uint64
+    dtype = np.uint32 if window <= 7 else np.uint64
     count = -(-neighbours // (8 * np.dtype(dtype).itemsize))
     words = np.zeros((count, *shape), dtype)
     _census_words(pixels, (0,) * radius, words)
