@@ -60,7 +60,7 @@ def _own_folder() -> Iterator[None]:
 def cached(kernel):
     """Compile a kernel that releases the GIL; without a writable folder, in every process again."""
     with _own_folder():
-        return njit(nogil=True, cache=bool(_folder()))(kernel)
+        return njit(nogil=True, cache=bool(_folder()), no_cfunc_wrapper=True)(kernel)
 
 
 @contextmanager

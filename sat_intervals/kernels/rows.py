@@ -137,7 +137,8 @@ def shift_equations(left, right, disparity, known, offset, step, radius):
                 value += down[a] * line
                 along_columns += down[a] * slope
                 along_rows += down_slope[a] * line
-            values[r, c] = value, 1.0, along_columns, along_rows
+            values[r, c, 0], values[r, c, 1] = value, 1.0  # a tuple in one go would take seconds longer to compile
+            values[r, c, 2], values[r, c, 3] = along_columns, along_rows
     count = len(range(radius, rows - radius, step)) * len(range(radius, columns - radius, step))
     equations, pixels = np.zeros((count, 4, 5)), np.zeros(count)
     n = 0
