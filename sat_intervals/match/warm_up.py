@@ -1,18 +1,32 @@
 """Compilation of the kernels, or loading from the cache, before the first tile."""
 
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
 
 from sat_intervals.config import Config, Volume
+from sat_intervals.kernels.compiled import none_is_cached
 from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.kernels.sgm import WAVEFRONTS
+from sat_intervals.machine import usable_cores
 from sat_intervals.match.borders import borders_of, trace_area
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.matching_cost import cost_areas
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
 from sat_intervals.match.patch import Frame, frame_area, match_costed, patch_areas, patch_windows
-from sat_intervals.match.postprocess import ConfidenceScale, postprocess_strips
-from sat_intervals.match.whole import whole_rows
+from sat_intervals.match.postprocess import ConfidenceScale, RawRows, postprocess_strips
+from sat_intervals.match.refinement import pixel_windows
 from sat_intervals.tiling import View, Window
+
+_BESIDE = """
+import sys
+from sat_intervals.config import Config
+from sat_intervals.match.warm_up import compile_postprocessing
+compile_postprocessing(Config.model_validate_json(sys.argv[1]))
+"""
 
 
 def compile_kernels(config: Config, *, hands_states_on: bool = True) -> None:
@@ -36,8 +50,38 @@ def compile_kernels(config: Config, *, hands_states_on: bool = True) -> None:
     zeros = np.zeros((area.base.height, area.base.width, padded_to_lanes(area.disparities)), np.uint16)
     made = [zeros] if isinstance(config.cost, Volume) else None
     costs = cost_areas(views, patch_areas(frame, config, ranges), config, statistics, made=made)
-    patch = match_costed(views, frame, costs, config, ranges=ranges)
+    match_costed(views, frame, costs, config, ranges=ranges)
     if hands_states_on and config.hands_states_on:
         (cost,) = cost_areas(views, [area], config, statistics, made=made)
         trace_area(cost, frame, borders_of(frame, config, [{} for _ in WAVEFRONTS]), 0, config, ranges)
-    list(postprocess_strips([whole_rows(patch, views, frame.whole, config)], ConfidenceScale(0.0, 1.0), config))
+    compile_postprocessing(config)
+
+
+def compile_postprocessing(config: Config) -> None:
+    """Compile every kernel that the settings need after matching, by rows of zeros."""
+
+    def zeros(dtype: type[np.generic], wider: int = 0) -> np.ndarray:
+        return np.zeros((4, 4 + wider), dtype)
+
+    lower, upper, lower_low, upper_low = (zeros(np.uint16 if config.bound_steps else np.int16) for _ in range(4))
+    rows = RawRows(
+        zeros(np.int16), lower, upper, zeros(np.float32), zeros(np.uint32), zeros(np.uint16),
+        zeros(np.int16, config.disparity.count - 1), lower_low, upper_low,
+        *(zeros(np.float32, window.width - 4) for window in pixel_windows(Window(0, 0, 4, 4), config)),
+    )  # fmt: skip
+    list(postprocess_strips([rows], ConfidenceScale(0.0, 1.0), config))
+
+
+@contextmanager
+def compiled_beside(config: Config) -> Iterator[None]:
+    """On a machine without compiled kernels, let a second process compile those after matching while the block runs."""
+    if not none_is_cached() or usable_cores() < 2:
+        yield
+        return
+    any_range = config.disparity.model_copy(update={"minimum": 0, "maximum": 3})
+    settings = config.model_copy(update={"disparity": any_range}).model_dump_json()
+    with subprocess.Popen([sys.executable, "-c", _BESIDE, settings], stderr=subprocess.DEVNULL) as process:
+        try:
+            yield
+        finally:
+            process.kill()
