@@ -1,7 +1,7 @@
 # `make demo` and `make test` need python3 (3.11 or newer) and make; everything else goes into $(VENV).
 PYTHON ?= python3
 VENV ?= .venv
-EXTRAS ?= test,lint,plot
+EXTRAS ?= test,plot
 
 BIN := $(VENV)/bin
 READY := $(VENV)/.has-$(EXTRAS)
@@ -25,11 +25,11 @@ test: $(READY)
 	$(PYTEST) $(PARALLEL) -m 'not process and not peer and not ported'
 
 # All tests; those that start processes and services run alone. With OPTIONS=--skip-nothing a skipped test fails.
-test-all: $(READY)
+test-all: $(READY) $(VENV)/.has-services
 	$(PYTEST) $(PARALLEL) -m 'not process'
 	$(PYTEST) -m process
 
-lint: $(READY)
+lint: $(READY) $(VENV)/.has-lint
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy

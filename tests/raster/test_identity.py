@@ -12,7 +12,6 @@ import zipfile
 from http.server import ThreadingHTTPServer
 from pathlib import Path
 
-import boto3
 import numpy as np
 import pytest
 import rasterio
@@ -245,6 +244,8 @@ def test_open_image__refuses_archives_on_servers(web_server, images, way):
 
 def test_open_image__finds_a_mask_among_many_files_of_a_bucket(bucket, images, monkeypatch):
     """A listing has 1000 names; GDAL must not take its first page for all."""
+    import boto3
+
     monkeypatch.setenv("AWS_S3_ENDPOINT", os.environ["AWS_ENDPOINT_URL"].removeprefix("http://"))
     monkeypatch.setenv("AWS_HTTPS", "NO")
     monkeypatch.setenv("AWS_VIRTUAL_HOSTING", "FALSE")

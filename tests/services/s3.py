@@ -6,7 +6,6 @@ import sys
 import tempfile
 from collections.abc import Iterator
 
-import boto3
 import pytest
 from helpers import wait_until
 
@@ -16,6 +15,8 @@ ACCESS = {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret", "AWS_DE
 @pytest.fixture(scope="module")
 def bucket() -> Iterator[str]:
     """URL of a bucket that this process and those it starts can reach."""
+    import boto3
+
     command = [sys.executable, "-m", "moto.server", "--host", "127.0.0.1", "--port", "0"]
     unbuffered = os.environ | {"PYTHONUNBUFFERED": "1"}
     with (

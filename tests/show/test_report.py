@@ -10,11 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from finished import MAXIMUM, MINIMUM, no_bands, random_bands, without_intervals, write_run
-from helpers import invoke
-from selenium.webdriver import ActionChains
-from selenium.webdriver.common.by import By
-from selenium.webdriver.common.keys import Keys
-from selenium.webdriver.support.wait import WebDriverWait
+from helpers import invoke, wait_until
 
 from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.products import INVALID
@@ -25,6 +21,7 @@ from sat_intervals.show.report import contents
 from sat_intervals.show.report.page import write_report
 
 ROOT = Path(__file__).parents[2]
+HOME, ARROW_RIGHT = "\ue011", "\ue014"  # keys by the standard WebDriver
 
 
 def contents_of(path):
@@ -135,12 +132,10 @@ class Page:
     def __init__(self, browser, path):
         self.browser = browser
         browser.get(path.as_uri())
-        WebDriverWait(browser, 20).until(
-            lambda _: browser.execute_script("return 'ready' in document.documentElement.dataset")
-        )
+        wait_until(lambda: browser.execute_script("return 'ready' in document.documentElement.dataset"), "page")
 
     def find(self, selector):
-        return self.browser.find_element(By.CSS_SELECTOR, selector)
+        return self.browser.find_element("css selector", selector)
 
     def text(self, selector):
         return self.find(selector).text
@@ -183,7 +178,7 @@ def test_page__tells_what_the_run_tells(page):
     ):
         assert words in page.text(selector)
     assert page.browser.execute_script("return document.querySelectorAll('svg[role=img][aria-label]').length") == 4
-    assert not page.browser.find_elements(By.CSS_SELECTOR, "#loading")
+    assert not page.browser.find_elements("css selector", "#loading")
     assert not {"null", "walltime"} & set(page.text("#run").split())  # settings without a value
 
 
@@ -192,7 +187,7 @@ def test_page__without_scripts_shows_a_table(browser, tmp_path):
     browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
     try:
         browser.get(path.as_uri())
-        text = browser.find_element(By.TAG_NAME, "body").text
+        text = browser.find_element("tag name", "body").text
     finally:
         browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
     assert "need JavaScript" in text
@@ -201,6 +196,8 @@ def test_page__without_scripts_shows_a_table(browser, tmp_path):
 
 
 def test_page__click_on_the_map_shows_that_row(page):
+    from selenium.webdriver import ActionChains
+
     before = page.band()
     assert before.count("M") > 3
     canvas = page.find("#map canvas")
@@ -218,10 +215,10 @@ def test_page__click_on_the_map_shows_that_row(page):
 
 def test_page__slider_works_from_the_keyboard(page):
     before = page.band()
-    page.find("#row").send_keys(Keys.HOME)
+    page.find("#row").send_keys(HOME)
     assert page.text("#row-number") == "0"
     first = page.band()
-    page.find("#row").send_keys(Keys.ARROW_RIGHT)
+    page.find("#row").send_keys(ARROW_RIGHT)
     assert page.text("#row-number") == "1"
     assert len({before, first, page.band()}) == 3
 
@@ -237,7 +234,7 @@ def test_page__says_of_a_pixel_what_the_files_say(browser, tmp_path):
 
 def test_page__layers_change_the_map_and_its_key(page):
     seen = {}
-    for label in page.browser.find_elements(By.CSS_SELECTOR, "#layers label"):
+    for label in page.browser.find_elements("css selector", "#layers label"):
         label.click()
         seen[label.text] = page.map(), page.text("#key")
     assert list(seen) == ["Left image", "Disparity", "Interval width", "Confidence", "Validity", "Misses"]
@@ -269,13 +266,13 @@ def test_page__of_a_run_without_intervals_claims_none(browser, tmp_path):
     assert "no valid pixel in this row" not in page.text("#profile")
     assert page.text("#profile-key").splitlines()[0].startswith("disparity")
     assert "band" not in page.text("#profile-key")
-    layers = [label.text for label in page.browser.find_elements(By.CSS_SELECTOR, "#layers label")]
+    layers = [label.text for label in page.browser.find_elements("css selector", "#layers label")]
     assert layers == ["Left image", "Disparity", "Confidence", "Validity"]
     bands = read_layers(tmp_path / "out" / "intervals.tif")
     disparity = np.where(read_layers(tmp_path / "out" / "validity.tif")[0] & INVALID == 0, bands[0], np.nan)
     column = int(np.flatnonzero(np.isfinite(disparity[20]))[0])
     for name, steps in (("row", 0), ("column", column)):
-        page.find(f"#{name}").send_keys(Keys.HOME if name == "column" else "", *[Keys.ARROW_RIGHT] * steps)
+        page.find(f"#{name}").send_keys(HOME if name == "column" else "", *[ARROW_RIGHT] * steps)
     words = page.text("#pixel").replace("\u2212", "-")
     assert f"disparity {disparity[20, column]:.1f}"[:-1] in words
     assert "interval " not in words.replace("interval regularised", "")

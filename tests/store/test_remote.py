@@ -9,7 +9,6 @@ from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 
-import boto3
 import psutil
 import pytest
 from helpers import COMMAND, OUTPUTS, PATIENCE, hashes, wait_until, write_pair
@@ -23,6 +22,8 @@ LOCK = ".sat-intervals.lock"
 
 def s3():
     """A client other than the tested one."""
+    import boto3
+
     return boto3.client("s3")
 
 
