@@ -11,7 +11,6 @@ from sat_intervals.config import Config, Volume
 from sat_intervals.kernels.compiled import none_is_cached
 from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.kernels.sgm import WAVEFRONTS
-from sat_intervals.machine import usable_cores
 from sat_intervals.match.borders import borders_of, trace_area
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.matching_cost import cost_areas
@@ -75,7 +74,7 @@ def compile_postprocessing(config: Config) -> None:
 @contextmanager
 def compiled_beside(config: Config) -> Iterator[None]:
     """On a machine without compiled kernels, let a second process compile those after matching while the block runs."""
-    if not none_is_cached() or usable_cores() < 2:
+    if not none_is_cached():
         yield
         return
     any_range = config.disparity.model_copy(update={"minimum": 0, "maximum": 3})

@@ -12,7 +12,7 @@ from sat_intervals.errors import RunError
 from sat_intervals.match.matching_cost import VolumeOf
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics, blocks, statistics_of
 from sat_intervals.match.schedule import Schedule
-from sat_intervals.match.warm_up import compile_kernels
+from sat_intervals.match.warm_up import compile_kernels, compiled_beside
 from sat_intervals.progress import Progress, add_seconds, logged_stage
 from sat_intervals.raster import Image
 from sat_intervals.results import open_run
@@ -84,7 +84,7 @@ def match_pair(
         Tiles failed; no output was published.
     """
     config, out, seconds = _named(load_config(config), volume_of), Path(out), dict[str, float]()
-    with Connection(config.cluster, out) as connection:
+    with Connection(config.cluster, out) as connection, compiled_beside(config):
         with logged_stage(seconds, "start"):
             finder = Finder(connection, progress, seconds)
             job = prepare(left, right, out, config, window=window, overwrite=overwrite, find=finder)
