@@ -107,7 +107,7 @@ def show_scene(scene: SceneMetrics) -> None:
     if deciles:
         show(["confidence", "pixels", "coverage", "mean width (px)"], deciles, "by decile of confidence")
     high, low = report["high"], report["low"]
-    if high["count"] and low["count"] and high["accuracy"] < low["accuracy"]:
+    if high["count"] and low["count"] and high["accuracy"] < low["accuracy"] - 0.005:
         click.echo(
             "confident pixels are covered less often than doubtful ones: errors of the truth and of sub-pixel "
             f"disparities count in intervals of {high['mean_width']:.2f} px, not in {low['mean_width']:.2f} px"

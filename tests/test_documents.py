@@ -120,7 +120,6 @@ NOT_RUN = {
     "--tune": "tests/run/test_calibrate.py",
     "lidar.tif": "tests/evaluate/test_dsm.py: there are no heights of others for the demo scene",
     "dsm one/": "tests/heights/test_dsm.py, with runs made up",
-    "dsm pair1/": "tests/heights/test_dsm.py, likewise",
     "heights.yaml": "tests/heights/test_dsm.py, with a calibration made up",
     "sat-intervals reference": "tests/heights/test_reference.py, likewise",
     "--truth out/truth.tif": "tests/heights/test_reference.py, with the truth of reference",

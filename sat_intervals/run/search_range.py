@@ -100,7 +100,7 @@ def search_range(workers: Workers, left: Image, right: Image, progress: Progress
         hints = "".join(f"; {line}" for line in collar_lines(collars, (left.path, right.path)))
         raise NoRangeError(
             f"{left.path} and {right.path}: {error}{hints}: give the search range with --disparity MIN MAX, or check "
-            "that the images are an epipolar pair"
+            "that the images are an epipolar pair: raw ones go to sat-intervals surface, or to rectify first"
         ) from None
     return replace(found_range, collars=collars)
 
