@@ -196,10 +196,9 @@ def test_measure_subjects__ends_where_an_image_changes(scene, tmp_path):
 
 def test_calibrate__takes_over_tiles_that_a_killed_one_left_in_a_store(scene, tmp_path, monkeypatch):
     store = "--set", f"cluster.store={tmp_path / 'store'}"
-    whole = calibrated(scene, tmp_path / "whole.yaml", *store)
     with monkeypatch.context() as killed:
         killed.setattr(Store, "remove", lambda store, kinds=(): None)
-        assert calibrated(scene, tmp_path / "killed.yaml", *store) == whole
+        whole = calibrated(scene, tmp_path / "killed.yaml", *store)
     damaged = next((tmp_path / "store").glob("*/tiles/*.npz"))
     damaged.write_bytes(damaged.read_bytes()[:-9])
     result = invoke("calibrate", scene, "--output", tmp_path / "again.yaml", "--name", "one", *store, "-q")

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rasterio
-from helpers import invoke, write_pair
+from helpers import hashes, invoke, write_pair
 
 from sat_intervals import SatIntervalsError, match_arrays, match_pair
 from sat_intervals.demo import make_scene
@@ -57,6 +57,18 @@ def folder(scene, tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module")
+def runs(folder, scene):
+    """What `match` prints with rows taken out, to the folder auto, and not, to the folder none."""
+    search = "--disparity", scene.minimum, scene.maximum
+    images = folder / "left.tif", folder / "right.tif"
+    return {rows: invoke("match", *images, folder / rows, *search, "--rows", rows).stdout for rows in ("auto", "none")}
+
+
+def report_of(out):
+    return json.loads((out / "run.json").read_text())
+
+
 def run(folder, out, scene, **settings):
     search = {"minimum": scene.minimum, "maximum": scene.maximum}
     return match_pair(folder / "left.tif", folder / "right.tif", out, {"disparity": search} | settings)
@@ -69,36 +81,34 @@ def good(out, scene):
     return (error <= 1).sum() / np.isfinite(scene.truth).sum()
 
 
+@pytest.mark.usefixtures("runs")
 def test_match_pair__takes_a_plane_of_rows_out(folder, scene, tmp_path):
-    report = run(folder, tmp_path / "auto", scene)
-    left = run(folder, tmp_path / "none", scene, rows="none")
+    report, left = report_of(folder / "auto"), report_of(folder / "none")
     write_pair(tmp_path, scene)
     unmoved = run(tmp_path, tmp_path / "unmoved", scene)
     assert (left["rows"], unmoved["rows"]) == (None, None)
-    rows = open_results(tmp_path / "auto").rows
+    rows = open_results(folder / "auto").rows
     row, column = np.mgrid[0:430:30, 0:520:30]
     assert np.abs(rows.at(row, column) - plane(row, column)).max() < 0.15
     found = report["survey"]["rows"]
     assert found["before"][0] > 1
     assert found["after"][0] < 0.1
-    assert good(tmp_path / "auto", scene) > good(tmp_path / "unmoved", scene) - 0.03
-    assert good(tmp_path / "none", scene) < 0.8 * good(tmp_path / "auto", scene)
+    assert good(folder / "auto", scene) > good(tmp_path / "unmoved", scene) - 0.03
+    assert good(folder / "none", scene) < 0.8 * good(folder / "auto", scene)
     assert any("rows differ by" in line and "match with --rows auto" in line for line in left["warnings"])
     assert not any("rows" in line for line in report["warnings"])
 
 
+@pytest.mark.usefixtures("runs")
 def test_match_pair__with_rows_taken_out_does_not_depend_on_tiles(folder, scene, tmp_path):
-    for name, size, workers in (("whole", 1024, 1), ("tiles", 64, 2)):
-        run(folder, tmp_path / name, scene, tiles={"size": size}, cluster={"workers": workers})
-    for name in ("intervals.tif", "validity.tif"):
-        with rasterio.open(tmp_path / "whole" / name) as one, rasterio.open(tmp_path / "tiles" / name) as other:
-            np.testing.assert_array_equal(one.read(), other.read())
+    run(folder, tmp_path / "tiles", scene, tiles={"size": 64}, cluster={"workers": 2})
+    assert hashes(folder / "auto") == hashes(tmp_path / "tiles")
     with rasterio.open(folder / "left.tif") as left, rasterio.open(folder / "right.tif") as right:
         arrays = (np.ma.masked_equal(file.read(1), 0) for file in (left, right))
         whole = match_arrays(*arrays, {"disparity": {"minimum": scene.minimum, "maximum": scene.maximum}})
-    with rasterio.open(tmp_path / "whole" / "intervals.tif") as file:
+    with rasterio.open(folder / "auto" / "intervals.tif") as file:
         np.testing.assert_array_equal(file.read(1), whole["disparity"])
-    assert json.loads(whole.attrs["rows"]) == json.loads((tmp_path / "whole" / "run.json").read_text())["rows"]
+    assert json.loads(whole.attrs["rows"]) == report_of(folder / "auto")["rows"]
 
 
 def test_read_window__no_data_grows_by_the_pixels_that_are_read(tmp_path):
@@ -121,13 +131,9 @@ def test_range_command__prints_the_rows(folder):
     assert survey["rows"]["before"][0] > 1
 
 
-def test_match_command__says_what_was_moved(folder, scene, tmp_path):
-    search = "--disparity", scene.minimum, scene.maximum
-    result = invoke("match", folder / "left.tif", folder / "right.tif", tmp_path / "out", *search)
-    assert result.exit_code == 0, result.output
-    assert "rows of the right image moved" in result.stdout
-    again = invoke("match", folder / "left.tif", folder / "right.tif", tmp_path / "plain", *search, "--rows", "none")
-    assert "rows of the right image moved" not in again.stdout
+def test_match_command__says_what_was_moved(runs):
+    assert "rows of the right image moved" in runs["auto"]
+    assert "rows of the right image moved" not in runs["none"]
 
 
 def test_match_pair__refuses_a_pair_whose_rows_are_too_far_apart(scene, tmp_path):

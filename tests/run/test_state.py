@@ -65,7 +65,7 @@ def test_match__with_an_equal_manifest_resumes(scene, tmp_path, options):
 
 
 def test_match__resumes_inside_blocks_of_tiles(tmp_path):
-    settings = write_pair(tmp_path, make_scene(512, 512, seed=1), tiles={"size": 64}, cluster={"workers": 1})
+    settings = write_pair(tmp_path, make_scene(320, 320, seed=1), tiles={"size": 64}, cluster={"workers": 1})
     images = tmp_path / "left.tif", tmp_path / "right.tif"
     match_pair(*images, tmp_path / "out", settings, keep_tiles=True)
     expected = hashes(tmp_path / "out")
