@@ -66,7 +66,12 @@ SEARCH = {"minimum": 0, "maximum": 9}
 VARIANTS = (
     {"preset": "satellite"},
     {"preset": "paper", "disparity": SEARCH | {"local": True}} | LEAST,
-    {"preset": "paper", "cost": {"method": "volume", "kind": "cost", "span": 24, "name": "kernels"}} | LEAST,
+    {
+        "preset": "paper",
+        "cost": {"method": "volume", "kind": "cost", "span": 24, "name": "kernels"},
+        "sgm": {"p1": 8, "p2": 32},
+    }
+    | LEAST,
 )
 
 

@@ -37,7 +37,7 @@ def turned(shape, origin, turn, scale=1.0):
 @given(seed=st.integers(0, 1000), scale=st.sampled_from([1.0, 1.3, 2.5]), turn=st.floats(-0.4, 0.4))
 def test_resample__equals_its_slow_twin(seed, scale, turn):
     random = np.random.default_rng(seed)
-    pixels = random.random((60, 60))
+    pixels = random.random((60, 60), np.float32)
     pixels[random.random(pixels.shape) < 0.02] = np.nan
     nodes = turned((6, 7), (28.3, 25.2), turn, scale) + random.uniform(-0.1, 0.1, (3, 3, 2))
     nodes[0, 2] = nodes[0, 2] if seed % 3 else np.nan
@@ -53,16 +53,17 @@ def test_resample__equals_its_slow_twin(seed, scale, turn):
         across = np.arange(int(np.floor(column)) - before, int(np.floor(column)) + after + 1)
         weights = np.outer(keys((row - down) / scale), keys((column - across) / scale))
         wanted = (weights * pixels[np.ix_(down, across)]).sum() / weights.sum()
-        assert_allclose(found[r, c], wanted, atol=1e-12)
+        assert_allclose(found[r, c], wanted, atol=1e-6)
 
 
 def test_resample__is_exact_for_quadratic_images():
     row, column = np.indices((40, 40), float)
     nodes = turned((12, 12), (15.0, 12.0), 0.3)
-    found = resample(0.2 * row**2 - row * column + 3 * column, (0, 0), nodes, STEP, (0, 0), 12, 12)
+    pixels = (0.2 * row**2 - row * column + 3 * column).astype(np.float32)
+    found = resample(pixels, (0, 0), nodes, STEP, (0, 0), 12, 12)
     places = np.array([[positions(nodes, r, c) for c in range(12)] for r in range(12)])
     y, x = np.moveaxis(places, -1, 0)
-    assert_allclose(found, 0.2 * y**2 - y * x + 3 * x, atol=1e-10)
+    assert_allclose(found, 0.2 * y**2 - y * x + 3 * x, atol=1e-3)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.5])
