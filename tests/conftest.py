@@ -62,16 +62,11 @@ def pytest_collection_finish() -> None:
 
 # Settings that need different machine code, those that take longest to compile first: each worker takes the next.
 LEAST = {"cross_check": None, "median": None, "regularization": None}
-SEARCH = {"minimum": 0, "maximum": 9}
+SEARCH, SGM = {"minimum": 0, "maximum": 9}, {"p1": 8, "p2": 32}
 VARIANTS = (
     {"preset": "satellite"},
     {"preset": "paper", "disparity": SEARCH | {"local": True}} | LEAST,
-    {
-        "preset": "paper",
-        "cost": {"method": "volume", "kind": "cost", "span": 24, "name": "kernels"},
-        "sgm": {"p1": 8, "p2": 32},
-    }
-    | LEAST,
+    {"preset": "paper", "cost": {"method": "volume", "name": "kernels", "span": 24}, "sgm": SGM} | LEAST,
 )
 
 

@@ -1,14 +1,8 @@
 """Compilation of the kernels, or loading from the cache, before the first tile."""
 
-import subprocess
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import numpy as np
 
 from sat_intervals.config import Config, Volume
-from sat_intervals.kernels.compiled import none_is_cached
 from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.kernels.sgm import WAVEFRONTS
 from sat_intervals.match.borders import borders_of, trace_area
@@ -19,13 +13,6 @@ from sat_intervals.match.patch import Frame, frame_area, match_costed, patch_are
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, postprocess_strips
 from sat_intervals.match.refinement import pixel_windows
 from sat_intervals.tiling import View, Window
-
-_BESIDE = """
-import sys
-from sat_intervals.config import Config
-from sat_intervals.match.warm_up import compile_postprocessing
-compile_postprocessing(Config.model_validate_json(sys.argv[1]))
-"""
 
 
 def compile_kernels(config: Config, *, hands_states_on: bool = True) -> None:
@@ -69,18 +56,3 @@ def compile_postprocessing(config: Config) -> None:
         *(zeros(np.float32, window.width - 4) for window in pixel_windows(Window(0, 0, 4, 4), config)),
     )  # fmt: skip
     list(postprocess_strips([rows], ConfidenceScale(0.0, 1.0), config))
-
-
-@contextmanager
-def compiled_beside(config: Config) -> Iterator[None]:
-    """On a machine without compiled kernels, let a second process compile those after matching while the block runs."""
-    if not none_is_cached():
-        yield
-        return
-    any_range = config.disparity.model_copy(update={"minimum": 0, "maximum": 3})
-    settings = config.model_copy(update={"disparity": any_range}).model_dump_json()
-    with subprocess.Popen([sys.executable, "-c", _BESIDE, settings], stderr=subprocess.DEVNULL) as process:
-        try:
-            yield
-        finally:
-            process.kill()

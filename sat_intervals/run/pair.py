@@ -12,11 +12,12 @@ from sat_intervals.errors import RunError
 from sat_intervals.match.matching_cost import VolumeOf
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics, blocks, statistics_of
 from sat_intervals.match.schedule import Schedule
-from sat_intervals.match.warm_up import compile_kernels, compiled_beside
+from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress, add_seconds, logged_stage
 from sat_intervals.raster import Image
 from sat_intervals.results import open_run
 from sat_intervals.run.assemble import assemble, end_tiles
+from sat_intervals.run.beside import compiled_beside
 from sat_intervals.run.connection import Connection
 from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.search_range import Finder

@@ -1,0 +1,31 @@
+"""Compilation of kernels beside a command, the first on a machine: numba uses one core of a process."""
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from sat_intervals.config import Config
+from sat_intervals.kernels.compiled import none_is_cached
+
+_COMPILE = """
+import sys
+from sat_intervals.config import Config
+from sat_intervals.match.warm_up import compile_postprocessing
+compile_postprocessing(Config.model_validate_json(sys.argv[1]))
+"""
+
+
+@contextmanager
+def compiled_beside(config: Config) -> Iterator[None]:
+    """On a machine without compiled kernels, let a second process compile those after matching while the block runs."""
+    if not none_is_cached():
+        yield
+        return
+    any_range = config.disparity.model_copy(update={"minimum": 0, "maximum": 3})
+    settings = config.model_copy(update={"disparity": any_range}).model_dump_json()
+    with subprocess.Popen([sys.executable, "-c", _COMPILE, settings], stderr=subprocess.DEVNULL) as process:
+        try:
+            yield
+        finally:
+            process.kill()
