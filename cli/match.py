@@ -44,8 +44,6 @@ def match(
 
         click.echo(job_script(config.cluster, out))
         return
-    if out.resolve() in (Path(image).parent.resolve() for image in pair.images):
-        warn([f"{out} also holds the images: write to another folder"])
     with Console(run.quiet or as_json) as console:
         settings.check_kept(out)
         left, right = pair.open()
@@ -53,4 +51,6 @@ def match(
     if as_json:
         say_json(report)
     console.summary(report, out, then="report")
+    if out.resolve() in (Path(image).parent.resolve() for image in pair.images):
+        warn([f"{out} also holds the images: write to another folder"])
     run.check_strict(report["warnings"])
