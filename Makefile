@@ -6,9 +6,10 @@ EXTRAS ?= test,plot
 BIN := $(VENV)/bin
 READY := $(VENV)/.has-$(EXTRAS)
 
-# One worker runs a whole file, so that its fixtures are prepared once.
+# One worker runs a whole file, so that its fixtures are prepared once. In the order of files, short ones come last;
+# by default those with few tests would, and the slowest have few.
 PYTEST := $(BIN)/python -m pytest $(OPTIONS)
-PARALLEL := -n logical --maxprocesses 8 --dist loadfile
+PARALLEL := -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
 # Python keeps the bytecode of what it imports: each process would otherwise compile it again, in seconds.
 unexport PYTHONDONTWRITEBYTECODE
