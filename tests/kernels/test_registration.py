@@ -56,7 +56,7 @@ def blocks_of(heights_at, shift, moves=1, noise=0.0, count=500, number=9, seed=0
         height = heights_at(east, north) + moves * shift[2]
         parts.append((np.full(count, index), x, y, height + noise * random.normal(size=count)))
     block, x, y, height = map(np.concatenate, zip(*parts, strict=True))
-    return Blocks(np.array(surfaces), CELL, block, x, y, height, moves)
+    return Blocks(np.array(surfaces, np.float32), CELL, block, x, y, height, moves)
 
 
 @pytest.mark.parametrize(("heights_at", "within", "moves"), [(hills, 0.05, 1), (hills, 0.05, -1), (town, 0.25, 1)])
@@ -93,7 +93,7 @@ def test_register__noise_does_not_move_aligned_surfaces():
 def test_register__deviations_cover_shifts_below_a_cell(heights_at, aligned):
     """Without bias, and in about 9 of 10 trials at .9, under white noise and noise as wide as three cells."""
     errors, deviations = [], []
-    for seed in range(16):
+    for seed in range(12):
         shift = CELL * np.array([3.7, -3.7] if seed % 2 else [0.25, -0.25])
         noise = {"noise": 0.5, "wide": (1, 3)[seed // 2 % 2]}
         blocks = blocks_of(heights_at, (*shift, 1.0), number=16, seed=seed, aligned=aligned, **noise)
