@@ -6,8 +6,8 @@ EXTRAS ?= test,plot
 BIN := $(VENV)/bin
 READY := $(VENV)/.has-$(EXTRAS)
 
-# One worker runs a whole file, so that its fixtures are prepared once. In the order of files, short ones come last;
-# by default those with few tests would, and the slowest have few.
+# One worker runs a whole file, so that its fixtures are prepared once. Files go in their own order: by default those
+# with few tests come last, and the slowest have few.
 PYTEST := $(BIN)/python -m pytest $(OPTIONS)
 PARALLEL := -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 

@@ -69,9 +69,9 @@ class Comparison:
         Heights that no ground has are NaN, and errors where they are ``needed``: undeclared no data, or another unit.
         """
         east, north, up = self.shift
-        cells, whole = place.moved(-east, -north), Window(0, 0, *shape)
         if smooth or (east, north) == (0.0, 0.0):
-            heights = read_heights(self.reference, cells, shape, whole, smooth=smooth)
+            cells = place.moved(-east, -north)
+            heights = read_heights(self.reference, cells, shape, Window(0, 0, *shape), smooth=smooth)
         else:
             heights = self._moved(place, shape, east, north)
         wrong = (heights < GROUND[0]) | (heights > GROUND[1])

@@ -223,10 +223,14 @@ def _median(values: np.ndarray) -> float:
     return float(np.median(known)) if known.size else np.nan
 
 
+def _spread(blocks: Blocks, shift: np.ndarray) -> float:
+    """Return the NMAD of differences."""
+    return _NORMAL * _median(_clipped(blocks, shift, np.inf))
+
+
 def _most(blocks: Blocks, shift: np.ndarray) -> float:
     """Return the distance from the median up to which differences count."""
-    scale = _NORMAL * _median(_clipped(blocks, shift, np.inf))
-    return _CLIP * max(scale, _FLOOR * blocks.cell)
+    return _CLIP * max(_spread(blocks, shift), _FLOOR * blocks.cell)
 
 
 def _searched(blocks: Blocks) -> np.ndarray | None:
@@ -260,8 +264,8 @@ def _with_deviation(blocks: Blocks, place: np.ndarray) -> tuple[np.ndarray, np.n
         rise, error = _mean_of_blocks(blocks, before + after - 2 * here)
         if not rise > max(_CLEARLY * error, _LEAST_RISE * blocks.cell):
             return None
-    most = _CLIP * _NORMAL * _median(_clipped(blocks, place, np.inf))
-    tried = (_solved(blocks, place, most, wide, walls=walls) for wide, walls in _WIDE)
+    outlier = _CLIP * _spread(blocks, place)
+    tried = (_solved(blocks, place, outlier, wide, walls=walls) for wide, walls in _WIDE)
     solved = next((found for found in tried if found is not None and found[1].max() < _SURE * blocks.cell), None)
     if solved is None:
         return None

@@ -17,7 +17,6 @@ from sat_intervals.progress import Progress, add_seconds, logged_stage
 from sat_intervals.raster import Image
 from sat_intervals.results import open_run
 from sat_intervals.run.assemble import assemble, end_tiles
-from sat_intervals.run.beside import compiled_beside
 from sat_intervals.run.connection import Connection
 from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.search_range import Finder
@@ -85,7 +84,7 @@ def match_pair(
         Tiles failed; no output was published.
     """
     config, out, seconds = _named(load_config(config), volume_of), Path(out), dict[str, float]()
-    with Connection(config.cluster, out) as connection, compiled_beside(config):
+    with Connection(config.cluster, out) as connection:
         with logged_stage(seconds, "start"):
             finder = Finder(connection, progress, seconds)
             job = prepare(left, right, out, config, window=window, overwrite=overwrite, find=finder)

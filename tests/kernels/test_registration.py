@@ -113,7 +113,7 @@ def test_register__noise_stays_as_it_is_in_towns(aligned, cells):
     blocks = blocks_of(lambda x, y: houses(cells * x, cells * y), (1.85, -1.85, 1.0), 1, 0.1, 500, 16, aligned=aligned)
     found = register(blocks)
     np.testing.assert_allclose(found.shift, (1.85, -1.85, 1.0), atol=0.06)
-    assert summary(found.after)["nmad"] == pytest.approx(0.1 * np.sqrt(2), rel=0.1)
+    assert summary(found.after)["nmad"] == pytest.approx(0.1 * np.sqrt(2), rel=0.07)
 
 
 def test_register__walls_to_one_side_move_nothing_where_the_ground_has_relief():
@@ -125,7 +125,8 @@ def test_register__walls_to_one_side_move_nothing_where_the_ground_has_relief():
     assert np.abs(found.shift[:2]).max() < 0.1 * CELL
 
 
-def test_register__known_heights_in_one_block_and_strips_are_too_few():
+def test_register__a_block_never_decides_alone():
+    """Of the others, strips are known, too narrow for the widest slopes."""
     blocks = blocks_of(hills, (0.5, 0.0, 1.0))
     surface = blocks.surface.copy()
     surface[1:, :, np.arange(surface.shape[2]) % 24 >= 12] = np.nan
