@@ -75,6 +75,7 @@ def write_pair(folder, size):
 # Prints the processor time of the command itself, without its workers, from the first strip on, and the bytes it wrote.
 CLIENT = """
 import json, sys, time
+from pathlib import Path
 from sat_intervals import match_pair
 def progress(stage, done, total):
     if stage in ("bands", "files"):
@@ -84,8 +85,8 @@ if __name__ == "__main__":
     left, right, out, minimum, maximum = sys.argv[1:]
     marks, search = {}, {"minimum": int(minimum), "maximum": int(maximum)}
     settings = {"disparity": search, "cluster": {"kind": "processes", "workers": 2}}
-    report = match_pair(left, right, out, settings, overwrite=True, progress=progress)
-    print(json.dumps([marks["end"] - marks["bands"], sum(file["bytes"] for file in report["files"].values())]))
+    match_pair(left, right, out, settings, overwrite=True, progress=progress)
+    print(json.dumps([marks["end"] - marks["bands"], sum(file.stat().st_size for file in Path(out).glob("*.tif"))]))
 """
 
 
