@@ -1,6 +1,5 @@
-"""The figures of docs/range.md: found ranges and local ranges on the pairs of ``SAT_INTERVALS_SHARED``."""
+"""The figures of docs/range.md: found ranges and local ranges on the pairs with truth of ``SAT_INTERVALS_SHARED``."""
 
-import json
 import os
 from pathlib import Path
 from typing import Any
@@ -55,7 +54,7 @@ def range_row(name: str, found: Found, truth: np.ndarray) -> tuple[str, float]:
 
 def figures(left: Any, right: Any, truth: np.ndarray, search: dict[str, Any]) -> list[float]:
     """Return the share of pixels kept, of them wrong by more than 1 px, and of their intervals with the truth."""
-    found = match_arrays(left, right, {"disparity": search})
+    found = match_arrays(left, right, {"preset": "paper", "disparity": search})
     disparity, lower, upper = (found[name].values for name in ("disparity", "lower", "upper"))
     kept = np.isfinite(disparity) & np.isfinite(truth)
     bad = np.abs(disparity - truth)[kept] > 1
@@ -66,16 +65,9 @@ def figures(left: Any, right: Any, truth: np.ndarray, search: dict[str, Any]) ->
 def main() -> None:
     """Print both tables."""
     ranges, matches, shares = [RANGE, "|---|---|---|---|---|---|"], [MATCH, "|---|---|---|---|---|---|---|"], []
-    for folder in sorted(path.parent for path in DATA.glob("*/left.tif")):
+    for folder in sorted(path.parent for path in DATA.glob("*/truth.tif")):
         left, right = read(folder / "left.tif"), read(folder / "right.tif")
         found = found_in(left, right)
-        if not (folder / "truth.tif").exists():
-            first, last = json.loads((folder / "meta.json").read_text())["disparity"]
-            width = (found.maximum - found.minimum) / (last - first)
-            ranges.append(
-                f"| {folder.name} | {found.minimum} to {found.maximum} | {first} to {last} searched | {width:.2f} | | |"
-            )
-            continue
         truth = read(folder / "truth.tif").filled(np.nan)
         row, share = range_row(folder.name, found, truth)
         ranges.append(row)
