@@ -35,7 +35,8 @@ def judged(scene: str, preset: str, interval: dict[str, Any], coverage: float) -
     """Match a scene in memory, and compare its intervals with the truth if it has one."""
     config = load_config({"preset": preset, "disparity": search_of(scene), "interval": interval})
     bands = match_arrays(read(scene, "left"), read(scene, "right"), config)
-    disparity, lower, upper, confidence, validity = (bands[name].values for name in bands)
+    names = "disparity", "lower", "upper", "confidence", "validity"
+    disparity, lower, upper, confidence, validity = (bands[name].values for name in names)
     low = low_confidence(confidence, config.regularization.threshold, config.regularization.kernel)
     kept = validity & INVALID == 0
     if (DATA / scene / "truth.tif").exists():
