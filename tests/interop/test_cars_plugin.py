@@ -6,6 +6,7 @@ import subprocess
 import sys
 import warnings
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -107,7 +108,8 @@ def test_cars_plugin__of_another_version_leaves_cars_alone(tmp_path):
 
 @pytest.mark.peer("cars")
 def test_cars_method__has_the_penalties_of_cars_and_confidence_relative_to_its_range():
-    import cars  # noqa: F401
+    with patch.dict(os.environ):  # it changes the environment of other tests: dask's configuration, numbers of threads
+        import cars  # noqa: F401
 
     from sat_intervals.interop.cars_method import SatIntervals
 
