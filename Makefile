@@ -25,9 +25,10 @@ demo: $(VENV)/.has-plot
 test: $(READY)
 	$(PYTEST) $(PARALLEL) -m 'not process and not peer and not ported'
 
-# All tests. With OPTIONS=--skip-nothing a skipped test fails.
+# All tests; those that start processes and services run alone. With OPTIONS=--skip-nothing a skipped test fails.
 test-all: $(READY) $(VENV)/.has-services
-	$(PYTEST) $(PARALLEL)
+	$(PYTEST) $(PARALLEL) -m 'not process'
+	$(PYTEST) -m process
 
 lint: $(READY) $(VENV)/.has-lint
 	$(BIN)/ruff check
