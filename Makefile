@@ -25,10 +25,9 @@ demo: $(VENV)/.has-plot
 test: $(READY)
 	$(PYTEST) $(PARALLEL) -m 'not process and not peer and not ported'
 
-# All tests; those that start processes and services run alone. With OPTIONS=--skip-nothing a skipped test fails.
+# All tests. With OPTIONS=--skip-nothing a skipped test fails.
 test-all: $(READY) $(VENV)/.has-services
-	$(PYTEST) $(PARALLEL) -m 'not process'
-	$(PYTEST) -m process
+	$(PYTEST) $(PARALLEL)
 
 lint: $(READY) $(VENV)/.has-lint
 	$(BIN)/ruff check
