@@ -27,13 +27,16 @@ PAGES = ROOT / "build" / "docs"
 CAMERAS = "--left-model demo/left_model.tif --right-model demo/right_model.tif"
 GRIDS = "--left-grid demo/left_grid.tif --right-grid demo/right_grid.tif"
 COMPARED = "--dsm demo/dsm.tif --reference demo/lidar.tif"
+ERRORS = f"sat-intervals evaluate {COMPARED} --pictures demo --overwrite"
 LOCAL = "--set disparity.local=true"
 # Commands of the gallery, run in the folder of its pictures: title, command, what it shows.
 GALLERY = (
     ("A scene with exact truth", "sat-intervals demo demo --size 700 700", None),
     ("Maps", "sat-intervals plot demo --dpi 90", "demo/overview.png"),
     ("Where intervals miss the truth", "sat-intervals plot demo --dpi 90", "demo/errors.png"),
-    ("Coverage and width", "sat-intervals plot demo --dpi 90", "demo/coverage.png"),
+    ("How well rows correspond", "sat-intervals plot demo --dpi 90", "demo/rows.png"),
+    ("A run at another coverage", "sat-intervals match demo/left.tif demo/right.tif half --coverage 0.5", None),
+    ("Coverage and width of both", "sat-intervals plot demo --dpi 90 --beside half", "demo/coverage.png"),
     ("A row", "sat-intervals plot demo --dpi 90 --row 350 --columns 100 500", "demo/profile.png"),
     ("The page of a run", "sat-intervals report demo", "demo/report.html"),
     ("Sensor models and heights of the scene", "python docs/pictures/demo_cameras.py demo", None),
@@ -41,8 +44,9 @@ GALLERY = (
     ("Margins from heights", f"sat-intervals calibrate {COMPARED} --output heights.yaml", None),
     ("The calibrated surface", "sat-intervals dsm demo --resolution 1 --calibration heights.yaml", None),
     ("Its heights and half widths", "sat-intervals plot demo --dpi 90", "demo/dsm.png"),
-    ("Its errors", f"sat-intervals evaluate {COMPARED} --pictures demo --overwrite", "demo/dsm-errors.png"),
-    ("A line across it", f"sat-intervals evaluate {COMPARED} --pictures demo --overwrite", "demo/dsm-profile.png"),
+    ("Its errors", ERRORS, "demo/dsm-errors.png"),
+    ("Half widths, and those needed", ERRORS, "demo/dsm-reliability.png"),
+    ("A line across it", ERRORS, "demo/dsm-profile.png"),
     ("A relief, with local ranges", f"sat-intervals demo relief --size 500 500 --relief 60 {LOCAL}", None),
     ("Its maps", "sat-intervals plot relief --dpi 90", "relief/overview.png"),
 )  # fmt: skip
@@ -196,5 +200,5 @@ def write_pages() -> None:
 if __name__ == "__main__":
     write_pages()
     (PAGES / "gallery.md").write_text(gallery())
-    subprocess.run([sys.executable, "-m", "mkdocs", "build", "--clean", "--strict", "--quiet"], cwd=ROOT, check=True)
+    subprocess.run([sys.executable, "-m", "mkdocs", "build", "--clean", "--strict"], cwd=ROOT, check=True)
     print("Open site/index.html")
