@@ -41,7 +41,7 @@ def plot(
     OUT/overview.png   always: left image, disparity, width, confidence, validity
     OUT/errors.png     with a truth and intervals: pixels whose interval misses it
     OUT/coverage.png   with --beside: nominal and measured coverage, width
-    OUT/rows.png       if rows were compared: row offsets, and what is left of them
+    OUT/rows.png       if rows were compared: offsets, and what is left of them
     OUT/range.png      for a found or local search range: matches, cells
     OUT/profile.png    with --row: interval, disparity and truth along a row
     OUT/curve.png      with --pixel: cost curve of a pixel and its interval
