@@ -116,7 +116,7 @@ def _end(status: int, message: str) -> NoReturn:
 @click.version_option(package_name="sat-intervals")
 @click.pass_context
 def main(context: click.Context) -> None:
-    """Match epipolar satellite images: a disparity for every pixel, with its interval."""
+    """Match satellite images: a disparity for every pixel, with its interval."""
     if context.invoked_subcommand is None:
         formatter = context.make_formatter()
         formatter.write_text(main.help or "")

@@ -40,12 +40,12 @@ def plot(
     \b
     OUT/overview.png   always: left image, disparity, width, confidence, validity
     OUT/errors.png     with a truth and intervals: pixels whose interval misses it
-    OUT/coverage.png   with --beside: nominal and measured coverage, width
+    OUT/coverage.png   with --beside: coverage asked for and measured, width
     OUT/rows.png       if rows were compared: offsets, and what is left of them
     OUT/range.png      for a found or local search range: matches, cells
     OUT/profile.png    with --row: interval, disparity and truth along a row
     OUT/curve.png      with --pixel: cost curve of a pixel and its interval
-    OUT/dsm.png        if dsm.tif exists: hillshade, height, width, confidence
+    OUT/dsm.png        with dsm.tif: hillshade, height, half width, confidence
 
     Rows and columns count from 0 at the first pixel of OUT/intervals.tif. Needs matplotlib: pip install
     'sat-intervals[plot]'.

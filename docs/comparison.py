@@ -1,6 +1,7 @@
 """The table of comparison.md: one raw pair through CARS with its own matcher, and through this project.
 
-Usage: python docs/comparison.py PAIR OUT. PAIR has left.tif, right.tif and their RPC models left.geom, right.geom. It
+Usage: python docs/comparison.py PAIR OUT. The terrain is that of raw_picanteo_pre; for another PAIR change HEIGHT, CRS
+and the place in write_terrain. PAIR has left.tif, right.tif and their RPC models left.geom, right.geom. It
 needs the extras `cars`, `dsm` and `test`.
 """
 

@@ -27,27 +27,26 @@ PAGES = ROOT / "build" / "docs"
 CAMERAS = "--left-model demo/left_model.tif --right-model demo/right_model.tif"
 GRIDS = "--left-grid demo/left_grid.tif --right-grid demo/right_grid.tif"
 COMPARED = "--dsm demo/dsm.tif --reference demo/lidar.tif"
-ERRORS = f"sat-intervals evaluate {COMPARED} --pictures demo --overwrite"
 LOCAL = "--set disparity.local=true"
 # Commands of the gallery, run in the folder of its pictures: title, command, what it shows.
 GALLERY = (
-    ("A scene with exact truth", "sat-intervals demo demo --size 700 700", None),
-    ("Maps", "sat-intervals plot demo --dpi 90", "demo/overview.png"),
-    ("Where intervals miss the truth", "sat-intervals plot demo --dpi 90", "demo/errors.png"),
-    ("How well rows correspond", "sat-intervals plot demo --dpi 90", "demo/rows.png"),
-    ("A run at another coverage", "sat-intervals match demo/left.tif demo/right.tif half --coverage 0.5", None),
-    ("Coverage and width of both", "sat-intervals plot demo --dpi 90 --beside half", "demo/coverage.png"),
+    ("A scene with exact truth", "sat-intervals demo demo --size 700 700", ""),
+    ("Maps, misses, rows", "sat-intervals plot demo --dpi 90", "demo/overview.png demo/errors.png demo/rows.png"),
+    ("A run at another coverage", "sat-intervals match demo/left.tif demo/right.tif half --coverage 0.5", ""),
+    ("Coverage and width of both runs", "sat-intervals plot demo --dpi 90 --beside half", "demo/coverage.png"),
     ("A row", "sat-intervals plot demo --dpi 90 --row 350 --columns 100 500", "demo/profile.png"),
     ("The page of a run", "sat-intervals report demo", "demo/report.html"),
-    ("Sensor models and heights of the scene", "python docs/pictures/demo_cameras.py demo", None),
-    ("A surface model", f"sat-intervals dsm demo --resolution 1 {CAMERAS} {GRIDS}", None),
-    ("Margins from heights", f"sat-intervals calibrate {COMPARED} --output heights.yaml", None),
-    ("The calibrated surface", "sat-intervals dsm demo --resolution 1 --calibration heights.yaml", None),
+    ("Sensor models and heights of the scene", "python docs/pictures/demo_cameras.py demo", ""),
+    ("A surface model", f"sat-intervals dsm demo --resolution 1 {CAMERAS} {GRIDS}", ""),
+    ("Margins from heights", f"sat-intervals calibrate {COMPARED} --output heights.yaml", ""),
+    ("The calibrated surface", "sat-intervals dsm demo --resolution 1 --calibration heights.yaml", ""),
     ("Its heights and half widths", "sat-intervals plot demo --dpi 90", "demo/dsm.png"),
-    ("Its errors", ERRORS, "demo/dsm-errors.png"),
-    ("Half widths, and those needed", ERRORS, "demo/dsm-reliability.png"),
-    ("A line across it", ERRORS, "demo/dsm-profile.png"),
-    ("A relief, with local ranges", f"sat-intervals demo relief --size 500 500 --relief 60 {LOCAL}", None),
+    (
+        "Its errors, half widths beside those needed, and a line across it",
+        f"sat-intervals evaluate {COMPARED} --pictures demo --overwrite",
+        "demo/dsm-errors.png demo/dsm-reliability.png demo/dsm-profile.png",
+    ),
+    ("A relief, with local ranges", f"sat-intervals demo relief --size 500 500 --relief 60 {LOCAL}", ""),
     ("Its maps", "sat-intervals plot relief --dpi 90", "relief/overview.png"),
 )  # fmt: skip
 
@@ -162,12 +161,12 @@ def gallery() -> str:
     lines = ["# Gallery", "", "Each picture was made by the command above it.", ""]
     folder = PAGES / "gallery-files"
     folder.mkdir()
-    for title, command, file in GALLERY:
+    for title, command, files in GALLERY:
         program, *arguments = command.split()
         words = ["-c", RUN, *arguments] if program == "sat-intervals" else [str(ROOT / arguments[0]), *arguments[1:]]
         subprocess.run([sys.executable, *words], cwd=folder, check=True, stdout=subprocess.DEVNULL)
         lines += [f"## {title}", "", "```", command, "```", ""]
-        if file:
+        for file in files.split():
             link = f"gallery-files/{file}"
             lines += [f"[![{title}]({link})]({link})" if file.endswith(".png") else f"[Open the page]({link})", ""]
     for file in [path for path in folder.rglob("*.*") if path.suffix not in (".png", ".html")]:

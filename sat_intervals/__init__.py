@@ -1,4 +1,4 @@
-"""Dense stereo matching of epipolar satellite images with confidence intervals on the disparity.
+"""Dense stereo matching of satellite images with confidence intervals on the disparity.
 
 Public names are imported on first use, so ``import sat_intervals`` and ``sat-intervals --help`` load neither numba nor
 dask.

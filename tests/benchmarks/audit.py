@@ -55,7 +55,8 @@ def main() -> None:
         error -= np.nanmedian(error)  # the truth has a constant bias
         known = np.isfinite(error)
         wrong, good = known & (abs(error) > BLUNDER), known & (abs(error) <= BLUNDER)
-        print(f"{name}: {1 - np.isfinite(given).mean():.3f} rejected, {share(wrong, known):.3f} of the others wrong")
+        kept, right = share(known, np.isfinite(truth)), share(abs(error) <= 1, np.isfinite(truth))
+        print(f"{name}: {kept:.3f} kept, {right:.3f} right to a pixel, {share(wrong, known):.3f} of the kept wrong")
         for words, settings in SETTINGS.items():
             found = intervals_around(*(np.ma.masked_equal(image, 0) for image in images), given, settings)
             agreement = found["agreement"].data
