@@ -92,10 +92,12 @@ class Run:
         return False
 
     def check_kept(self, outputs: Iterable[str | Path], inputs: Iterable[str | Path | None] = ()) -> None:
-        """Raise if an output would replace a file of the run, one of its inputs, the truth, or one of ``inputs``."""
+        """Raise if an output would replace a file of the run, its inputs, a given truth, or one of ``inputs``."""
         own = [self.out / name for name in (*_BANDS, "run.json")]
         grid = self.config.disparity.grid  # other rasters are inputs
-        check_not_replaced([*own, *paths_of(self.report["inputs"]), grid, self.truth_beside, *inputs], outputs)
+        truth = self.truth_beside
+        given = None if truth.exists() and "REFERENCE" in read_tags(truth) else truth  # `reference` may replace its own
+        check_not_replaced([*own, *paths_of(self.report["inputs"]), grid, given, *inputs], outputs)
 
     def layer(self, path: str | Path) -> Layer:
         """Open another raster of the same pixels, such as the truth."""

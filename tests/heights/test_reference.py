@@ -299,10 +299,11 @@ def test_make_truth__registers_points(tmp_path):
 
 @pytest.fixture(scope="module")
 def relief(tmp_path_factory):
-    """A run on relief, the files of its cameras, and a reference."""
+    """A run on relief whose images lie in its folder, as those of `surface`, the files of its cameras, a reference."""
     folder = tmp_path_factory.mktemp("relief")
     out, files, _ = run_of(folder, seen_of(hills, VIEWS[0]))
     report = json.loads((out / "run.json").read_text())
+    report["inputs"]["left"]["path"] = str(out / "left.tif")
     report["inputs"]["left"]["sha256"] = 64 * "0"
     (out / "run.json").write_text(json.dumps(report))
     return out, files, write_heights(folder / "hills.tif", on_ground(hills))
