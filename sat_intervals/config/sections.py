@@ -251,7 +251,7 @@ class CrossCheck(Section):
     """Rejection of pixels whose left and right disparities disagree."""
 
     method: Literal["fast", "accurate"] = Field(
-        "fast", description="right disparities from the left costs, or matched on their own at up to 1.7 times the work"
+        "fast", description="right disparities from the left costs, or matched on their own at up to twice the work"
     )
     tolerance: int = Field(1, ge=0, description="largest difference of the two disparities, in pixels")
 
