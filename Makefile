@@ -14,7 +14,7 @@ PARALLEL := -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 # Python keeps the bytecode of what it imports: each process would otherwise compile it again, in seconds.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-all lint bench bench-seams surface-bounds tune calibration coverage pictures docs dist clean
+.PHONY: demo test test-all lint bench bench-seams surface-bounds ablation tune calibration coverage pictures docs dist clean
 
 demo: $(VENV)/.has-plot
 	$(BIN)/sat-intervals demo demo-out --overwrite --size 800 800
@@ -42,6 +42,10 @@ bench: $(VENV)/.has-bench,dsm
 # The tables of docs/speed.md on exact seams; about seven minutes.
 bench-seams: $(VENV)/.has-bench
 	$(BIN)/python tests/benchmarks/seams.py
+
+# The paper's table 2, on the Middlebury pairs of SAT_INTERVALS_SHARED; a minute.
+ablation: $(VENV)/.has-test
+	PYTHONPATH=tests $(BIN)/python -W ignore tests/benchmarks/ablation.py
 
 # The tables of README.md and docs/presets.md, on the pairs of SAT_INTERVALS_SHARED; after `make calibration` minutes.
 tune: $(VENV)/.has-mccnn

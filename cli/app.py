@@ -11,7 +11,6 @@ from typing import Any, NoReturn
 
 import click
 
-from sat_intervals.cli.ablate import ablate
 from sat_intervals.cli.batch import batch
 from sat_intervals.cli.calibrate import calibrate
 from sat_intervals.cli.config import config
@@ -44,7 +43,7 @@ STEPS: dict[str, tuple[click.Command, ...]] = {
     "Match": (match, batch, status),
     "Look": (plot, report, project),
     "Heights": (surface, rectify, dsm, triangulate),
-    "Compare with a truth": (reference, evaluate, calibrate, ablate),
+    "Compare with a truth": (reference, evaluate, calibrate),
     "Use elsewhere": (export, stac),
 }
 # The most common commands, which the command without arguments shows.

@@ -48,14 +48,11 @@ class Judging:
         return config
 
 
-def judging_options(command: Command, *, levels: bool = True) -> Command:
-    """Add the options of commands that evaluate pairs with known truth; the command gets ``judging``, a `Judging`.
-
-    ``levels`` is that of `settings_options`.
-    """
+def judging_options(command: Command) -> Command:
+    """Add the options of commands that evaluate pairs with known truth; the command gets ``judging``, a `Judging`."""
     quiet_option = click.option("--quiet", "-q", is_flag=True, help="Print figures and errors only.")
     with_judging = gathered("judging", Judging, tolerance_option, json_option, quiet_option)
-    return settings_options(with_judging(log_options(command)), levels=levels)
+    return settings_options(with_judging(log_options(command)))
 
 
 @dataclass(frozen=True)

@@ -128,16 +128,3 @@ def share(answers):
 def middle(values):
     """Median, None of none."""
     return median(values) if values else None
-
-
-def baseline(volume, impossible):
-    """First and last index whose similarity, the curve scaled to its own extremes, is at least 0.9; -1 for none."""
-    lower, upper = np.full(volume.shape[:2], -1), np.full(volume.shape[:2], -1)
-    for r, c in np.ndindex(lower.shape):
-        costs = {k: int(cost) for k, cost in enumerate(volume[r, c]) if cost != impossible}
-        if costs:
-            lowest, highest = min(costs.values()), max(costs.values())
-            # (highest - cost) / (highest - lowest) >= 9 / 10 in integers
-            cut = [k for k, cost in costs.items() if 10 * (highest - cost) >= 9 * (highest - lowest)]
-            lower[r, c], upper[r, c] = min(cut), max(cut)
-    return lower, upper

@@ -1,4 +1,4 @@
-"""Make the paper's tables: means over scenes, with the figures of the paper and of its implementation, Pandora.
+"""Make the paper's table 1: means over scenes, with the figures of the paper and of its implementation, Pandora.
 
 Pandora was measured with penalties 8 and 32, on pixels that pass its accurate cross-checking. None was not measured.
 """
@@ -19,11 +19,10 @@ TABLE_1 = {
     "overest.": ("low", "relative_overestimation"),
     "overest. with rejected": ("with_rejected", "low", "relative_overestimation"),
 }
-METHODS = ("baseline", "0.5", "0.8", "0.9", "0.98", "0.9 regularised")
-TABLE_2 = {method: (method, "accuracy") for method in METHODS}
 OBJECTIVE = 0.9  # the paper's target accuracy of each scene
+_Published = Mapping[tuple[str, str], tuple[float | None, ...]]
 
-_PAPER_1 = {
+_PAPER_1: _Published = {
     ("census", "middlebury2003"): (0.973, 0.033, 0.983, 0.033, 0.942, 0.183, 0.165),
     ("census", "middlebury2005"): (0.963, 0.026, 0.969, 0.026, 0.950, 0.218, 0.152),
     ("census", "middlebury2006"): (0.989, 0.026, 0.993, 0.026, 0.980, 0.569, 0.109),
@@ -35,29 +34,18 @@ _PAPER_1 = {
     ("mccnn", "middlebury2014"): (0.983, 0.029, 0.972, 0.013, 0.996, 0.993, 0.339),
     ("mccnn", "middlebury2021"): (0.991, 1.000, 0.969, 0.026, 0.999, 1.000, 0.314),
 }
-_REFERENCE_1 = {
+_REFERENCE_1: _Published = {
     ("census", "middlebury2003"): (0.975, 0.035, None, None, None, None, 0.479, 0.06),
     ("census", "middlebury2005"): (0.959, 0.026, None, None, None, None, 0.637, 0.14),
     ("census", "middlebury2006"): (0.988,),
     ("mccnn", "middlebury2003"): (0.971, 0.036),
     ("mccnn", "middlebury2005"): (0.976, 0.040),
 }
-_PAPER_2 = {
-    ("census", "middlebury2003"): (0.503, 0.997, 0.985, 0.982, 0.980, 0.973),
-    ("census", "middlebury2005"): (0.592, 0.978, 0.958, 0.950, 0.944, 0.963),
-    ("census", "middlebury2006"): (0.626, 0.986, 0.982, 0.979, 0.976, 0.989),
-    ("census", "middlebury2014"): (0.039, 0.543, 0.519, 0.494, 0.474, 0.957),
-    ("census", "middlebury2021"): (0.030, 0.549, 0.478, 0.442, 0.420, 0.936),
-}
-_REFERENCE_2 = {
-    ("census", "middlebury2003"): (0.481, 0.997, 0.970, 0.955, 0.943, 0.975),
-    ("census", "middlebury2005"): (0.580, 0.997, 0.958, 0.932, 0.909, 0.959),
-}
 
 
 @dataclass(frozen=True)
 class SceneMetrics:
-    """The report of one scene (from `evaluate_run` or `ablate_pair`) and its group."""
+    """The report of one scene from `evaluate_run` and its group."""
 
     name: str
     group: str
@@ -74,16 +62,6 @@ class Row:
     at_objective: int | None = None
 
 
-def table_1(scenes: Iterable[SceneMetrics]) -> list[Row]:
-    """Return accuracy, relative size and overestimation by group (paper, table 1)."""
-    return _table(scenes, TABLE_1, ACCURACY, {"paper": _PAPER_1, "reference": _REFERENCE_1})
-
-
-def table_2(scenes: Iterable[SceneMetrics]) -> list[Row]:
-    """Return the accuracy of the ablation's methods by group (paper, table 2)."""
-    return _table(scenes, TABLE_2, TABLE_2[METHODS[-1]], {"paper": _PAPER_2, "reference": _REFERENCE_2})
-
-
 def look_up(report: dict[str, Any], place: tuple[str, ...]) -> float | None:
     """Return the figure at a path of a report, None if it is missing."""
     found: Any = report
@@ -92,12 +70,8 @@ def look_up(report: dict[str, Any], place: tuple[str, ...]) -> float | None:
     return None if found is None else float(found)
 
 
-def _table(
-    scenes: Iterable[SceneMetrics],
-    columns: Mapping[str, tuple[str, ...]],
-    accuracy: tuple[str, ...],
-    others: dict[str, Any],
-) -> list[Row]:
+def table_1(scenes: Iterable[SceneMetrics]) -> list[Row]:
+    """Return accuracy, relative size and overestimation by group (paper, table 1)."""
     groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for scene in scenes:
         groups.setdefault((scene.report["cost"], scene.group), []).append(scene.report)
@@ -107,13 +81,13 @@ def _table(
     # List the costs of a group one below the other.
     for cost, group in sorted(groups, key=lambda key: places.index(key[1])):
         reports = groups[cost, group]
-        means = {name: _mean([look_up(report, place) for report in reports]) for name, place in columns.items()}
-        reached = sum((look_up(report, accuracy) or 0.0) >= OBJECTIVE for report in reports)
+        means = {name: _mean([look_up(report, place) for report in reports]) for name, place in TABLE_1.items()}
+        reached = sum((look_up(report, ACCURACY) or 0.0) >= OBJECTIVE for report in reports)
         rows.append(Row(f"{group} {cost}" if several else group, means, len(reports), reached))
-        for label, table in others.items():
+        for label, table in {"paper": _PAPER_1, "reference": _REFERENCE_1}.items():
             if (cost, group) in table:
-                known = dict(zip(columns, table[cost, group], strict=False))
-                rows.append(Row(label, {name: known.get(name) for name in columns}))
+                known = dict(zip(TABLE_1, table[cost, group], strict=False))
+                rows.append(Row(label, {name: known.get(name) for name in TABLE_1}))
     return rows
 
 

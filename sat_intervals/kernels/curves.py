@@ -7,8 +7,6 @@ They work row by row, because their temporary arrays are as large as the costs.
 Letters: r row, c column, k disparity index (disparity = minimum + k).
 """
 
-from collections.abc import Callable
-
 import numpy as np
 
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY
@@ -64,17 +62,19 @@ def read_right_winners(volume: np.ndarray, minimum: int) -> np.ndarray:
     return winner
 
 
-def _read_bounds(
-    volume: np.ndarray, minimum: int, limit: Callable[[np.ndarray, np.ndarray], np.ndarray], refine: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """First and last disparity whose cost is at most ``limit(curves, lowest costs)`` of a row."""
+def read_alpha_cuts(volume: np.ndarray, minimum: int, cut_level: int, refine: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds of the alpha-cut of every curve (paper eq. 5 to 9), extended for refinement.
+
+    Returns ``(lower, upper)``, ``(rows, columns)`` int16 disparities, NO_DISPARITY for none; ``cut_level`` is
+    ``floor((1 - alpha) * span)``.
+    """
     lower = np.full(volume.shape[:2], NO_DISPARITY, np.int16)
     upper = lower.copy()
     last = volume.shape[2] - 1
     for r, row in enumerate(volume):
         lowest = row.min(axis=1, keepdims=True).astype(np.int64)
         found = lowest[:, 0] != IMPOSSIBLE_COST
-        inside = row <= np.minimum(limit(row, lowest), IMPOSSIBLE_COST - 1).astype(np.uint16)
+        inside = row <= np.minimum(lowest + cut_level, IMPOSSIBLE_COST - 1).astype(np.uint16)
         if refine:
             winners = row == lowest.astype(np.uint16)
             inside[:, :-1] |= winners[:, 1:]
@@ -82,15 +82,6 @@ def _read_bounds(
         lower[r, found] = (minimum + inside.argmax(axis=1))[found]
         upper[r, found] = (minimum + last - inside[:, ::-1].argmax(axis=1))[found]
     return lower, upper
-
-
-def read_alpha_cuts(volume: np.ndarray, minimum: int, cut_level: int, refine: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of the alpha-cut of every curve (paper eq. 5 to 9), extended for refinement.
-
-    Returns ``(lower, upper)``, ``(rows, columns)`` int16 disparities, NO_DISPARITY for none; ``cut_level`` is
-    ``floor((1 - alpha) * span)``.
-    """
-    return _read_bounds(volume, minimum, lambda curves, lowest: lowest + cut_level, refine)
 
 
 def read_subpixel_cut(
@@ -111,18 +102,3 @@ def read_subpixel_cut(
     winner = steps * (disparity - minimum)
     lower, upper = min(ends[0], np.floor(winner)), max(ends[1], np.ceil(winner))
     return float(minimum + lower / steps), float(minimum + upper / steps)
-
-
-def read_baseline(volume: np.ndarray, minimum: int, part: int, whole: int) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of the paper's baseline (its section 4.1): each curve is normalised by its own minimum and maximum.
-
-    Similarity is 1 at a curve's lowest possible cost and 0 at its highest. The bounds are the first and last disparity
-    of similarity at least ``1 - part / whole``, two integers. Returns as `read_alpha_cuts`, without extension.
-    """
-
-    def limit(curves: np.ndarray, lowest: np.ndarray) -> np.ndarray:
-        highest = np.where(curves == IMPOSSIBLE_COST, 0, curves).max(axis=1, keepdims=True)
-        limits: np.ndarray = lowest + (highest - lowest) * part // whole
-        return limits
-
-    return _read_bounds(volume, minimum, limit, False)

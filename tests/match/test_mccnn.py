@@ -334,13 +334,6 @@ def test_match__preset_mccnn_brings_its_penalties_and_curves_are_drawn(tmp_path)
         read_curve(results, row, column)
 
 
-def test_ablate__takes_mccnn(tmp_path):
-    write_pair(tmp_path, make_scene(120, 160), group="city")
-    report = json.loads(invoke("ablate", "--preset", "mccnn", "--json", tmp_path).stdout)
-    assert report["cost"] == "mccnn"
-    assert report["baseline"]["accuracy"] < report["0.9 regularised"]["accuracy"]
-
-
 def test_match_batch__measures_each_pair_and_goes_on_after_one_that_it_cannot(tmp_path, network_file):
     left, right = masked_images(60, 140)
     write(tmp_path / "left.tif", left), write(tmp_path / "right.tif", right)
