@@ -48,8 +48,9 @@ ablation: $(VENV)/.has-test
 	PYTHONPATH=tests $(BIN)/python -W ignore tests/benchmarks/ablation.py
 
 # The tables of README.md and docs/presets.md, on the pairs of SAT_INTERVALS_SHARED; after `make calibration` minutes.
+# NAMES: presets, or penalties to compare them with.
 tune: $(VENV)/.has-mccnn
-	$(BIN)/python -W ignore tests/benchmarks/tune.py
+	$(BIN)/python -W ignore tests/benchmarks/tune.py $(NAMES)
 
 # The built-in calibrations, on the pairs of SAT_INTERVALS_SHARED; ten minutes of processor time.
 calibration: $(VENV)/.has-mccnn

@@ -24,7 +24,6 @@ from sat_intervals.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from sat_intervals.cli.console import Console
     from sat_intervals.config import Calibration
     from sat_intervals.config.pairs import Pair
     from sat_intervals.run.measure import Subject
@@ -33,10 +32,6 @@ _CALIBRATION = """\
 # Calibration: levels of the cost curve, and factors, that reach a coverage, found by sat-intervals calibrate.
 # Use it with: sat-intervals match LEFT RIGHT OUT --coverage 0.9 --calibration FILE, with the settings of `key`.
 # `expected`: figures of pairs with the levels found on the other pairs; coverage of all, high and low confidence.
-"""
-_SETTINGS = """\
-# Settings with their calibration, found by sat-intervals calibrate --tune.
-# Use them with: sat-intervals match LEFT RIGHT OUT --disparity MIN MAX --config FILE
 """
 
 
@@ -51,9 +46,6 @@ _SETTINGS = """\
     "--by-group", is_flag=True, help="Leave out all pairs of a group together (meta.json, CSV), not each pair."
 )
 @click.option("--name", help="Name of the calibration; by default that of the file.")
-@click.option(
-    "--tune", is_flag=True, help="Compare presets and penalties; write the best as settings for match --config."
-)
 @surface_options("Calibrate this surface model against --reference, instead of pairs.", "pairs", "coverage")
 @json_option
 @click.option(
@@ -71,7 +63,6 @@ def calibrate(
     overwrite: bool,
     truth: tuple[Path, ...],
     name: str | None,
-    tune: bool,
     surface: Surface | None,
     coverage: float | None,
     settings: SettingsArguments,
@@ -111,11 +102,8 @@ def calibrate(
     folder = output.absolute().parent
     check_subjects(subjects)
     with Console(quiet or as_json) as console:
-        if tune:
-            _tune(subjects, output, folder, name, console, as_json)
-            return
-        parts, key = measure_subjects(subjects, folder, console.progress)
-    calibration, expected = calibration_from(parts, subjects, name or output.stem, key)
+        parts = measure_subjects(subjects, folder, console.progress)
+    calibration, expected = calibration_from(parts, subjects, name or output.stem)
     write_calibration(output, calibration)
     if as_json:
         say_json({"calibration": calibration.model_dump(mode="json"), "expected": expected})
@@ -204,38 +192,3 @@ def _of_run(out: Path, truth: Path | None, judging: _Judging) -> "Subject":
 def write_calibration(output: Path, calibration: "Calibration") -> None:
     """Write a calibration with an explanation."""
     write(output, _CALIBRATION, calibration.model_dump(mode="json"))
-
-
-def _tune(
-    subjects: "list[Subject]",
-    output: Path,
-    folder: Path,
-    name: str | None,
-    console: "Console",
-    as_json: bool,
-) -> None:
-    """Compare settings, print their figures, and write the best."""
-    from sat_intervals.cli.tables import show_tuned
-    from sat_intervals.config.candidates import candidates
-    from sat_intervals.config.weights import INSTALL_MCCNN
-    from sat_intervals.errors import SatIntervalsError
-    from sat_intervals.run.tune import OF_ALL, best_of, has_network, settings_of, tuned
-
-    if not has_network():
-        console.say(f"MC-CNN is left out: to include it, {INSTALL_MCCNN}")
-    found = []
-    for label, changes in candidates(subjects[0].config, with_network=has_network()):
-        console.say(f"calibrating {label}")
-        try:
-            found.append(tuned(label, changes, subjects, folder, console.progress))
-        except OF_ALL:
-            raise
-        except SatIntervalsError as error:
-            console.say(f"{label} is left out: {error}")
-    best = best_of(found)
-    if as_json:
-        say_json([{"name": one.name, "kept": one.kept, "good": one.good, **one.figures} for one in found])
-    elif not console.quiet:
-        show_tuned(found, best)
-    write(output, _SETTINGS, settings_of(best, name or best.name))
-    console.say(str(output))

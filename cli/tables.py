@@ -12,7 +12,6 @@ from sat_intervals.evaluate.paper import ACCURACY, OBJECTIVE, Row, SceneMetrics,
 
 if TYPE_CHECKING:
     from sat_intervals.config import Calibration
-    from sat_intervals.run.tune import Tuned
 
 # Characters of a line in a file or a pipe: lines are not wrapped.
 _WIDEST = 10_000
@@ -209,15 +208,6 @@ def show_calibration(calibration: "Calibration", expected: Sequence[dict[str, fl
     show(header, rows, "expected: coverage, widths and score (px) of pairs left out, and levels")
     for note in calibration.provenance["notes"]:
         click.echo(note)
-
-
-def show_tuned(found: "Sequence[Tuned]", best: "Tuned") -> None:
-    """Print the figures of settings that were compared."""
-    rows = [
-        [one.name + (" *" if one is best else ""), _figure(one.kept), _figure(one.good), *_expected(one.figures)]
-        for one in found
-    ]
-    show(["settings", "kept", "good", *_EXPECTED], rows, "coverage 0.9, pairs left out; * the best, which is written")
 
 
 def _expected(figures: Mapping[str, float]) -> list[str]:

@@ -116,7 +116,6 @@ NOT_RUN = {
     "pair/left.tif": "likewise",
     "surface left.tif right.tif out/ --resolution 1": "likewise",
     "dsm run/": "likewise",
-    "--tune": "tests/run/test_calibrate.py",
     "lidar.tif": "tests/evaluate/test_dsm.py: there are no heights of others for the demo scene",
     "dsm one/": "tests/heights/test_dsm.py, with runs made up",
     "heights.yaml": "tests/heights/test_dsm.py, with a calibration made up",
@@ -150,7 +149,6 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
             shutil.copy(folder / f"{side}.tif", folder / name)
     (folder / "pairs.csv").write_text("name,left,right,minimum,maximum\na,left.tif,right.tif,-12,40\n")
     (folder / "cluster.yaml").write_text("disparity: {minimum: -12, maximum: 40}\ncluster: {workers: 2}\n")
-    (folder / "tuned.yaml").write_text("disparity: {minimum: -12, maximum: 40}\n")
     return folder
 
 

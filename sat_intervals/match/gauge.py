@@ -79,14 +79,10 @@ class Gauge:
         self._names = [f"block {part}" for part in range(parts)] if in_blocks else [group]
         self._rungs, self._tolerance = rungs, tolerance
         self._tables = np.zeros((parts, rungs.low.size, SCHEMES, FIELDS))
-        self._known, self._good = np.zeros((2, parts))
 
     def measured(self) -> list[Measured]:
         """Return the measurement of each part."""
-        parts = [
-            Measured(name, 1.0, table, int(known), int(good))
-            for name, table, known, good in zip(self._names, self._tables, self._known, self._good, strict=True)
-        ]
+        parts = [Measured(name, 1.0, table) for name, table in zip(self._names, self._tables, strict=True)]
         kept = sum(part.kept for part in parts)
         return [part._replace(weight=1 / max(kept, 1)) for part in parts]
 
@@ -109,8 +105,6 @@ class Gauge:
                 strip._replace(lower=lower, upper=upper, lower_low=lower, upper_low=upper), scale, config
             )
             piece = _Piece(rows, inner.start, inner.stop, *truth)
-            if rung == (0 if self._rungs.are_one else OF_FITS):
-                self._count(piece)
             for number, scheme, bounds in self._bounds(piece, rung, config):
                 self._tables[:, number, scheme] += self._measured(piece, scheme, bounds, config)
 
@@ -126,12 +120,6 @@ class Gauge:
         for scheme, quantile in enumerate((None, *QUANTILES)):
             if scheme != HIGH or self._rungs.are_one:
                 yield rung, scheme, regularized(piece.rows, piece.first, piece.last, config, quantile)
-
-    def _count(self, piece: _Piece) -> None:
-        """Count pixels with truth, and good ones."""
-        near = piece.kept & (abs(piece.of("disparity") - piece.truth) <= 1)
-        for counts, chosen in ((self._known, np.isfinite(piece.truth)), (self._good, near)):
-            counts += np.bincount(piece.parts[chosen], minlength=counts.size)
 
     def _measured(
         self, piece: _Piece, scheme: int, bounds: tuple[np.ndarray, np.ndarray], config: Config

@@ -42,14 +42,11 @@ class Measured(NamedTuple):
     group: parts of one group are left out together.
     weight: of a pixel: one over the pixels of the pair, so that every pair weighs the same.
     table: ``(rungs, schemes, fields)`` float64 sums over kept pixels with truth.
-    known, good: pixels with truth, and those of them that are kept and within 1 px of it.
     """
 
     group: str
     weight: float
     table: np.ndarray
-    known: int
-    good: int
 
     @property
     def kept(self) -> int:

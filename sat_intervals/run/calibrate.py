@@ -68,7 +68,7 @@ def _checked_truths(subject: Subject) -> tuple[int, int]:
 
 
 def calibration_from(
-    parts: Sequence[Measured], subjects: Sequence[Subject], name: str, key: dict[str, Any] | None = None
+    parts: Sequence[Measured], subjects: Sequence[Subject], name: str
 ) -> tuple[Calibration, list[dict[str, float]]]:
     """Return the calibration of measured subjects, and what to expect of it: a row for each coverage."""
     pairs = [
@@ -78,4 +78,4 @@ def calibration_from(
         for search in (subject.config.disparity,)
     ]
     config = subjects[0].config
-    return calibration_of_parts(parts, config, name, pairs, key or key_of(config))
+    return calibration_of_parts(parts, config, name, pairs, key_of(config))

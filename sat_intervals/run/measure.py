@@ -6,11 +6,10 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from sat_intervals.config import Config, key_of
+from sat_intervals.config import Config
 from sat_intervals.config.sections import Refinement
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.match.gauge import OF_FITS, Gauge, at_levels, block_numbers, pairs_of
@@ -80,12 +79,10 @@ def check_enough(pixels: int, subjects: Sequence[Subject], what: str) -> None:
         )
 
 
-def measure_subjects(
-    subjects: Sequence[Subject], folder: Path, progress: Progress
-) -> tuple[list[Measured], dict[str, Any]]:
-    """Match subjects at every level of the ladder, in ``folder``; return measurements, and the `key_of` settings."""
+def measure_subjects(subjects: Sequence[Subject], folder: Path, progress: Progress) -> list[Measured]:
+    """Match subjects at every level of the ladder, in ``folder``, and measure them."""
     found: list[Measured] = []
-    key, rungs = key_of(subjects[0].config), ladders(subjects[0].config)
+    rungs = ladders(subjects[0].config)
     compile_kernels(at_levels(subjects[0].config, 0.0, 0.0, QUANTILES[-1]))
     with _scratch(folder) as scratch, Connection(subjects[0].config.cluster, scratch) as workers:
         for number, subject in enumerate(subjects):
@@ -94,7 +91,7 @@ def measure_subjects(
             found += _of_subject(workers, subject, rungs, scratch / str(number), len(subjects) == 1, one)
     progress("subjects", len(subjects), len(subjects))
     check_enough(sum(part.kept for part in found), subjects, "kept pixels have a truth")
-    return found, key
+    return found
 
 
 @contextmanager

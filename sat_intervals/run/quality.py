@@ -197,7 +197,7 @@ def noise_line(survey: Survey | None, paths: tuple[str, str]) -> list[str]:
         return []
     return [
         f"{paths[0]} and {paths[1]}: matching pixels differ {survey.noise:.2f} times as much as random pixels, the "
-        "pair is noisy: try --preset satellite, or find penalties with calibrate --tune"
+        "pair is noisy: try --preset satellite"
     ]
 
 

@@ -44,6 +44,18 @@ DEVELOPMENT = MIDDLEBURY + SYNTHETIC
 WORLDVIEW = ("us3d_jax_079", "us3d_jax_559")
 
 
+def settings_of(name: str) -> dict[str, Any]:
+    """Return the settings of a preset, or of penalties such as ``census 5, 8/64`` or ``mccnn, 1/6``, with its span."""
+    if name in PRESETS:
+        return {"preset": name}
+    cost, _, penalties = name.partition(", ")
+    lower, upper = map(float, penalties.split("/"))
+    if cost == "mccnn":
+        sgm = {"penalty": "constant", "p1": lower, "p2": upper, "span": 10 * upper}
+        return {"preset": "satellite-mccnn", "sgm": sgm}
+    return {"cost": {"window": int(cost.split()[1])}, "sgm": {"p1": int(lower), "p2": int(upper)}}
+
+
 def scenes_of(preset: str) -> tuple[str, ...]:
     """Return the scenes that the calibration of a preset is made from."""
     return DEVELOPMENT + WORLDVIEW if preset.startswith("satellite") else DEVELOPMENT
@@ -62,7 +74,7 @@ def tolerance_of(scene: str) -> float:
 
 def subject_of(scene: str, preset: str) -> Subject:
     """Open a scene to calibrate with."""
-    config = load_config({"preset": preset, "disparity": search_of(scene)})
+    config = load_config(settings_of(preset) | {"disparity": search_of(scene)})
     left, right = (open_image(DATA / scene / f"{side}.tif") for side in ("left", "right"))
     truth, tolerance = truth_of(left, DATA / scene / "truth.tif"), tolerance_of(scene)
     return Subject(scene, scene, left, right, truth, config, None, tolerance, tolerance > 0)
@@ -100,7 +112,7 @@ def measured(preset: str) -> tuple[list[Subject], list[Measured]]:
     kept = KEPT / f"{preset}-{digest.hexdigest()[:16]}.gz"
     if not kept.exists():
         with tempfile.TemporaryDirectory() as folder:
-            found, _ = measure_subjects(subjects, Path(folder), lambda *_: None)
+            found = measure_subjects(subjects, Path(folder), lambda *_: None)
         KEPT.mkdir(parents=True, exist_ok=True)
         with gzip.open(kept.with_suffix(".new"), "wb", 3) as file:
             pickle.dump(found, file)

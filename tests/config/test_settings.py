@@ -191,7 +191,7 @@ def test_load_config__reads_a_file_by_path_or_name(write) -> None:
 
 @pytest.mark.parametrize("text", ["", "# only comments\n", "---\n"])
 def test_load_config__takes_no_empty_file_for_the_defaults(write, text: str) -> None:
-    """Those of `calibrate --tune` are empty, or end in their first comment, after a power loss."""
+    """After a power loss a file may be empty."""
     with pytest.raises(ConfigError, match="has no settings, or was cut off: restore it, or leave it out"):
         load_config(write(text), RANGE)
 

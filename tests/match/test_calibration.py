@@ -37,8 +37,7 @@ def part(needed_high, needed_low, group="one", widen=None):
             width = np.full(needed.size, widen(scheme, level) if widen else level)
             truth = np.where(needed <= level, 0.0, width + 1)  # missed by 1 px
             table[rung, scheme] = measure(0 * width, width, truth, 0.0, np.zeros(needed.size, int), 1)[0]
-    pixels = len(needed_high) + len(needed_low)
-    return Measured(group, 1 / pixels, table, 2 * pixels, pixels // 2)
+    return Measured(group, 1 / (len(needed_high) + len(needed_low)), table)
 
 
 def test_measure__a_worked_example():

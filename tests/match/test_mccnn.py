@@ -11,14 +11,12 @@ import onnx
 import pytest
 import rasterio
 import reference
-from helpers import bands, hashes, invoke, write_pair
+from helpers import bands, hashes, invoke
 from networks import random_weights, slow_features, trained_network, write_network
 
 from sat_intervals import RunError, SatIntervalsError, load_config, match_arrays, match_pair
 from sat_intervals.config.pairs import PairOfBatch
-from sat_intervals.config.settings import key_of
 from sat_intervals.config.weights import weights_file
-from sat_intervals.demo import make_scene
 from sat_intervals.errors import ChangedInputError
 from sat_intervals.kernels.matching import cost_volume
 from sat_intervals.match.matching_cost import Area, cost_areas, view_windows
@@ -27,11 +25,9 @@ from sat_intervals.match.normalization import ImageStatistics, PairStatistics
 from sat_intervals.match.patch import kernel_settings
 from sat_intervals.match.whole import cut, whole_view
 from sat_intervals.products import COSINE_STEPS, IMPOSSIBLE_COST, INVALID
-from sat_intervals.raster import open_image
 from sat_intervals.results import open_results
 from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
-from sat_intervals.run.measure import Subject, measure_subjects, truth_of
 from sat_intervals.run.tile import match_block
 from sat_intervals.show.cost_curve import read_curve
 from sat_intervals.tiling import Window
@@ -374,21 +370,6 @@ def test_match_tile__another_onnxruntime_on_a_worker_is_noticed(tmp_path, networ
     monkeypatch.setattr("sat_intervals.run.job.version", lambda name: "0.1" if name == "onnxruntime" else installed)
     with pytest.raises(RunError, match=r"onnxruntime is 0.1 here, but the run has .*: install the same for all"):
         match_block(job, next(iter(job.store.grid)))
-
-
-def test_measure_subjects__other_weights_between_two_pairs_are_noticed(tmp_path):
-    write_pair(tmp_path, make_scene(90, 120))
-    file = write_network(tmp_path / "network.onnx", random_weights())
-    left, right = (open_image(tmp_path / name) for name in ("left.tif", "right.tif"))
-    config = settings(-4, 6, file)
-    subject = Subject("one", "one", left, right, truth_of(left, tmp_path / "truth.tif"), config)
-
-    def exchange_at_the_end(stage, done, total):
-        if (stage, done) == ("subjects", 1):
-            write_network(file, random_weights(seed=1))
-
-    before = key_of(config)
-    assert measure_subjects([subject], tmp_path, exchange_at_the_end)[1] == before != key_of(config)
 
 
 @pytest.mark.parametrize("name", ["int8", "fp32"])

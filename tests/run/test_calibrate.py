@@ -14,20 +14,14 @@ from sat_intervals import SatIntervalsError, match_pair, open_image
 from sat_intervals.cli.calibrate import _Judging, _subjects
 from sat_intervals.cli.matching import SettingsArguments
 from sat_intervals.config import PRESETS, Cluster, calibration_of, load_calibration, load_config
-from sat_intervals.config import candidates as compared
 from sat_intervals.config.calibration import COVERAGES
-from sat_intervals.config.candidates import candidates
 from sat_intervals.demo import make_scene
-from sat_intervals.errors import ChangedInputError, InputError
+from sat_intervals.errors import ChangedInputError
 from sat_intervals.evaluate.disparity import evaluate_run
-from sat_intervals.match import measurement
-from sat_intervals.raster import OutputError, write_layer
-from sat_intervals.run import tune
+from sat_intervals.raster import write_layer
 from sat_intervals.run.calibrate import check_subjects
 from sat_intervals.run.job import prepare
 from sat_intervals.run.measure import Subject, measure_subjects, truth_of
-from sat_intervals.run.tune import Tuned, best_of
-from sat_intervals.store.manifest import StoreError
 from sat_intervals.store.tiles import Store
 
 
@@ -330,74 +324,3 @@ def test_load_calibration__built_in_ones_come_from_the_command_and_expect_more_o
         assert sorted(row[name] for row in figures) == [row[name] for row in figures], name
     assert all(abs(row["all"] - row["coverage"]) < 0.03 for row in figures)
     assert len(found.provenance["pairs"]) == (14 if "satellite" in preset else 12)
-
-
-# ---- Tuning ------------------------------------------------------------------------------------------------
-def test_candidates__are_presets_and_a_ladder_of_different_settings():
-    search = {"disparity": {"minimum": 0, "maximum": 1}}
-    own = load_config(search)
-    found = dict(candidates(own, with_network=True))
-    assert len({str(load_config({**changes, **search}).sgm) for changes in found.values()}) >= 12
-    assert {"paper", "satellite", "satellite-mccnn", "census 5, 8/64", "mccnn, 1/6"} <= found.keys()
-    assert not any("mccnn" in name for name, _ in candidates(own, with_network=False))
-    other = load_config(search, {"sgm": {"p1": 9}})
-    assert next(candidates(other, with_network=False)) == ("own settings", None)
-
-
-def test_best_of__has_the_best_score_of_those_with_many_good_pixels():
-    found = [Tuned(name, (), 0.9, good, {"score": score}, None) for name, good, score in CANDIDATES]
-    assert best_of(found).name == "best"
-    weak = [Tuned("no truth", (), 0.9, 1.0, figures, None) for figures in ({}, {"score": np.nan})]
-    assert best_of([*weak, *found]).name == "best"
-    with pytest.raises(SatIntervalsError, match="no settings leave enough pixels"):
-        best_of(weak)
-
-
-CANDIDATES = ("few", 0.5, 3.0), ("wide", 0.8, 9.0), ("best", 0.78, 5.0)
-
-
-def test_tune__match_takes_the_file(scene, tmp_path, monkeypatch):
-    """Settings that cannot be compared are left out."""
-    found = [("weak", {"sgm": {"p2": 10**6}}), ("stronger", {"sgm": {"p2": 64}})]
-    monkeypatch.setattr(compared, "candidates", lambda own, with_network: found)
-    arguments = "calibrate", scene, "--tune", "--output", tmp_path / "tuned.yaml", "--tile-size", 512
-    result = invoke(*arguments)
-    assert result.exit_code == 0, result.output
-    assert "weak is left out: sgm.p2 is 1000000, allowed" in result.output
-    line = next(line for line in result.output.splitlines() if line.startswith("stronger *"))
-    kept, good, coverage = map(float, line.split()[2:5])
-    assert 0.5 < good < kept < 1
-    assert 0.8 < coverage < 0.96
-    arguments = scene / "left.tif", scene / "right.tif", tmp_path / "out", "--disparity", -8, 8
-    result = invoke("match", *arguments, "--config", tmp_path / "tuned.yaml", "--quiet")
-    assert result.exit_code == 0, result.output
-    used = json.loads((tmp_path / "out" / "run.json").read_text())["settings"]
-    assert (used["sgm"]["p2"], used["interval"]["coverage"], used["tiles"]["size"]) == (64, 0.9, 512)
-    assert used["interval"]["calibration"]["name"] == "stronger"
-
-
-@pytest.mark.parametrize("error", [StoreError, OutputError, InputError])
-def test_tune__ends_where_other_settings_would_not_help(scene, tmp_path, monkeypatch, error):
-    def full(*arguments):
-        raise error("no space")
-
-    monkeypatch.setattr(tune, "tuned", full)
-    result = invoke("calibrate", scene, "--tune", "--output", tmp_path / "tuned.yaml", "--quiet")
-    assert (result.exit_code, result.stderr) == (2, "sat-intervals: no space\n")
-
-
-def test_tune__a_name_and_quiet(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        "sat_intervals.config.candidates.candidates", lambda own, with_network: [("own settings", None)]
-    )
-    monkeypatch.setattr(measurement, "_RUNGS", 5)  # the levels do not matter here
-    assert calibrated(scene, tmp_path / "tuned.yaml", "--tune", "--config", stronger(tmp_path))
-    written = yaml.safe_load((tmp_path / "tuned.yaml").read_text())
-    assert written["interval"]["calibration"]["name"] == "one"
-    assert written["sgm"]["p2"] == 48
-
-
-def stronger(folder):
-    file = folder / "stronger.yaml"
-    file.write_text("sgm: {p2: 48}\n")
-    return file
