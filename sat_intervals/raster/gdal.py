@@ -24,12 +24,6 @@ GDAL_ERRORS = (RasterioError, CPLE_BaseError, SystemError)
 _QUIET = ("ignore", None, NotGeoreferencedWarning, re.compile(re.escape(__name__)), 0)
 _LOCK = threading.Lock()
 
-# Formats of which GDAL takes missing data for zeros, does not list the files, or reads on after their end forever.
-UNCHECKED = {
-    "AAIGrid", "BAG", "DAAS", "EEDAI", "ENVI", "ESRIC", "GPKG", "GRASSASCIIGrid", "GTI", "HDF5", "HDF5Image", "ILWIS",
-    "ISG", "KMLSUPEROVERLAY", "MBTiles", "MRF", "PCIDSK", "PCRaster", "PLMOSAIC", "Rasterlite", "S102", "S104", "S111",
-    "SQLite", "STACIT", "STACTA", "WCS", "WMS", "WMTS", "Zarr", "netCDF",
-}  # fmt: skip
 # GDAL's prefixes of files on servers, with and without a URL in the form of a query.
 _REMOTE = "vsicurl/", "vsicurl?", "vsis3/", "vsigs/", "vsiaz/", "vsiadls/", "vsioss/", "vsiswift/", "vsiwebhdfs/"
 # With these, all files of an image are read as they are now, whatever the environment of a worker, and damage is an
@@ -45,22 +39,8 @@ _STRICT = {
     "VRT_NUM_THREADS": "1",
     "GDAL_PNG_WHOLE_IMAGE_OPTIM": "NO",  # reads what is missing from memory that was never written
 }
-_EXTENSIONS = "CPL_VSIL_CURL_ALLOWED_EXTENSIONS"  # often .tif alone, without masks
-if _EXTENSIONS in os.environ:
-    _STRICT[_EXTENSIONS] = f"{os.environ[_EXTENSIONS]},.msk,.ovr,.aux.xml"
 # A source of a VRT that cannot be opened fails without a message in each other dataset until the first is closed.
 _OF_SOURCES = threading.RLock()
-
-
-class _Reader(DatasetReader):  # type: ignore[misc]
-    """A dataset that raises if a source cannot be read. GDAL reports a missing source of a nested VRT only once."""
-
-    def read(self, indexes: int | None = None, *, out_shape: Any = None, **options: Any) -> np.ndarray:
-        values = super().read(indexes, out_shape=out_shape, **options)
-        if self.driver == "VRT" and out_shape is None:
-            for band in self.indexes if indexes is None else [indexes]:
-                self.checksum(band, window=options.get("window"))  # reads again, and says that it fails
-        return np.asarray(values)
 
 
 @contextmanager
@@ -69,7 +49,7 @@ def reading(path: str, **options: Any) -> Iterator[DatasetReader]:
     _accept_no_georeferencing()
     # rasterio casts the no-data value to the type: -1.8e308, of ArcGIS, overflows float32
     with Env(**_STRICT), np.errstate(over="ignore"):
-        dataset = _Reader(path, **options)
+        dataset = DatasetReader(path, **options)
         with _OF_SOURCES if dataset.driver == "VRT" else nullcontext(), dataset:
             yield dataset
 

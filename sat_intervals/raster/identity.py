@@ -16,8 +16,8 @@ from sat_intervals.store.folder import object_tag
 
 # GDAL's prefixes of object stores, and those of fsspec.
 _STORES = {"/vsis3/": "s3://", "/vsigs/": "gs://", "/vsiaz/": "az://"}
-# GDAL's prefix to read inside a file: an archive, or a part given by offset and size.
-_INSIDE = re.compile(r"/vsi\w+/(\d+(_\d+)?,)?")
+# GDAL's prefix to read inside an archive.
+_INSIDE = re.compile(r"/vsi\w+/")
 # Names that are no paths: GDAL's file systems and subdatasets, and URLs.
 _NO_PATH = re.compile(r"/vsi|\w+:")
 # Seconds until a server must answer.
@@ -36,8 +36,6 @@ def identity(path: str, known: Mapping[str, Mapping[str, Any]] | None = None) ->
             file = file.resolve()
             path = str(file)
         return {"path": path} | _of_file(file, (known or {}).get(path, {}))
-    if path.startswith("/vsicurl?"):
-        raise SatIntervalsError(f"{path}: a change of this file would not be noticed: give its URL alone")
     name = path.removeprefix("/vsicurl/")
     if name.startswith(("http://", "https://")):
         return {"path": path} | _of_url(name)
@@ -45,19 +43,17 @@ def identity(path: str, known: Mapping[str, Mapping[str, Any]] | None = None) ->
         if path.startswith((prefix, scheme)):
             return {"path": path} | object_tag(path.replace(prefix, scheme, 1))
     if not _NO_PATH.match(path):
-        raise ChangedInputError(f"{path} cannot be read: it is missing, or a link to nothing: restore or remove it")
+        raise ChangedInputError(
+            f"{path} cannot be read: it is missing, a folder, or a link to nothing: restore it"
+        )
     return {"path": path}
 
 
 def local_file(path: str) -> Path | None:
-    """Return the local file behind a GDAL name, such as the archive in ``/vsizip/{a.zip}/left.tif``; None if remote."""
-    name = path
-    while found := _INSIDE.match(name):
-        name = name[found.end() :]
-    if name == path:
-        return Path(path) if os.path.isfile(path) else None
-    place = Path(name.replace("{", "").replace("}", ""))
-    return next((file for file in (place, *place.parents) if os.path.isfile(file)), None)
+    """Return the local file behind a GDAL name, such as the archive in ``/vsizip/a.zip/left.tif``; None if remote."""
+    place = Path(_INSIDE.sub("", path, count=1))
+    places = (place,) if str(place) == path else (place, *place.parents)
+    return next((file for file in places if os.path.isfile(file)), None)
 
 
 def _of_file(file: Path, before: Mapping[str, Any]) -> dict[str, Any]:
@@ -80,11 +76,6 @@ def _of_url(url: str) -> dict[str, Any]:
         return {}
     size = headers.get("Content-Range", "").rpartition("/")[2] or headers.get("Content-Length", "")
     tag = headers.get("ETag") or headers.get("Last-Modified")
-    if not tag:
-        raise SatIntervalsError(
-            f"{url}: its server sends neither ETag nor Last-Modified, so a change during the run would not be noticed: "
-            "download it"
-        )
     return {"bytes": int(size) if size.isdigit() else None, "etag": tag}
 
 

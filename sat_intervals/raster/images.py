@@ -15,7 +15,7 @@ from rasterio.io import DatasetReader
 from sat_intervals.errors import InputError
 from sat_intervals.kernels.rows import RowOffsets
 from sat_intervals.raster import gdal
-from sat_intervals.raster.files_of import check_listed, files_of
+from sat_intervals.raster.files_of import files_of
 from sat_intervals.raster.georeferencing import Georeferencing, horizontal_name
 from sat_intervals.raster.identity import identity
 from sat_intervals.tiling import Window
@@ -76,7 +76,6 @@ def open_image(
     name = _absolute(path)
     mask = None if mask is None else _absolute(mask)
     with opened(name) as dataset:
-        check_listed(name, dataset)
         colours = enumerate(dataset.colorinterp, start=1)
         alphas = [number for number, kind in colours if kind == ColorInterp.alpha and number != band]
         others = [number for number in dataset.indexes if number not in alphas]
@@ -200,7 +199,6 @@ def _chosen(path: str, bands: list[int], alphas: list[int], band: int | None) ->
 
 def _check_mask(image: Image, mask: str) -> None:
     with opened(mask) as dataset:
-        check_listed(mask, dataset)
         height, width = dataset.shape
     if (height, width) != (image.height, image.width):
         sizes = f"{height} x {width} pixels, {image.path} {image.height} x {image.width}"

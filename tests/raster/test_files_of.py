@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from sat_intervals.errors import InputError
-from sat_intervals.raster import files_of, open_image
+from sat_intervals.raster import files_of
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -93,32 +92,6 @@ def test_files_of__have_no_overviews_and_statistics(folder):
         shutil.copy(folder / "mask.tif", folder / name)
     (folder / "image.tif.aux.xml").write_text("<PAMDataset/>")
     assert files_of(str(folder / "image.tif")) == [str(folder / name) for name in ("image.tif", "image.tif.msk")]
-
-
-REFUSED = {
-    "raw": f'<VRTDataset rasterXSize="{SIZE}" rasterYSize="{SIZE}"><VRTRasterBand dataType="Byte" band="1" '
-    'subclass="vrtrawrasterband"><SourceFilename relativeToVRT="1">mask.tif</SourceFilename></VRTRasterBand>'
-    "</VRTDataset>",
-    "processed": '<VRTDataset subClass="VRTProcessedDataset"><Input><SourceFilename relativeToVRT="1">mask.tif'
-    "</SourceFilename></Input><ProcessingSteps><Step><Algorithm>BandAffineCombination</Algorithm><Argument "
-    'name="coefficients_1">0,1</Argument></Step></ProcessingSteps></VRTDataset>',
-}
-
-
-@pytest.mark.parametrize("kind", REFUSED)
-def test_files_of__refuse_a_virtual_raster_that_hides_missing_data(folder, kind):
-    (folder / "inner.vrt").write_text(REFUSED[kind])
-    (folder / "outer.vrt").write_text(virtual(1, "inner.vrt"))
-    for read, name in ((files_of, "inner.vrt"), (files_of, "outer.vrt"), (open_image, "inner.vrt")):
-        with pytest.raises(InputError, match=r"inner\.vrt has a format \(VRT\) in which GDAL does not report missing"):
-            read(str(folder / name))
-
-
-def test_files_of__refuse_a_format_that_hides_missing_data(folder):
-    with rasterio.open(folder / "a.bil", "w", "ENVI", SIZE, SIZE, 1, dtype="uint8") as file:
-        file.write(np.ones((1, SIZE, SIZE), "uint8"))
-    with pytest.raises(InputError, match=r"a\.bil has a format \(ENVI\) in which GDAL .*: convert it with gdal_trans"):
-        open_image(folder / "a.bil")
 
 
 def test_files_of__lists_the_source_of_a_mask_band(folder):

@@ -1,7 +1,6 @@
 """Identity of input files; inputs on a web server, read by windows and identified by size and ETag."""
 
 import hashlib
-import io
 import itertools
 import json
 import os
@@ -192,11 +191,6 @@ def test_match__ends_where_an_image_on_a_server_changes_and_publishes_nothing(we
     assert [path.name for path in out.iterdir()] == [".sat-intervals.lock"]
 
 
-def test_identity__of_a_url_in_a_query_is_refused():
-    with pytest.raises(SatIntervalsError, match="a change of this file would not be noticed: give its URL alone"):
-        identity("/vsicurl?url=http%3A%2F%2F127.0.0.1%2Fleft.tif")
-
-
 @pytest.mark.parametrize("path", ["http://127.0.0.1:1/image.tif", "/vsimem/image.tif", "nowhere://image.tif"])
 def test_identity__of_what_nobody_tells_more_of_is_its_name(path):
     assert identity(path) == {"path": path}
@@ -229,19 +223,6 @@ def test_open_image__counts_each_file_on_a_server_once(web_server, images):
     assert all(file["etag"] for file in files)
 
 
-@pytest.mark.parametrize("way", ["/vsizip//vsicurl/{}/left.tif", "zip+{}!left.tif"])
-def test_open_image__refuses_archives_on_servers(web_server, images, way):
-    """Nobody would notice a change: GDAL does not say whether one has changed."""
-    memory = io.BytesIO()
-    with zipfile.ZipFile(memory, "w") as archive:
-        archive.writestr("left.tif", images["left.tif"])
-    put({"all.zip": memory.getvalue()}, web_server.folder)
-    name = way.format(f"http://127.0.0.1:{web_server.server_address[1]}/all.zip")
-    with pytest.raises(subprocess.CalledProcessError) as failure:
-        opened(name)
-    assert "is read from files whose changes would not be noticed: download or extract it" in failure.value.stderr
-
-
 def test_open_image__finds_a_mask_among_many_files_of_a_bucket(bucket, images, monkeypatch):
     """A listing has 1000 names; GDAL must not take its first page for all."""
     import boto3
@@ -256,15 +237,6 @@ def test_open_image__finds_a_mask_among_many_files_of_a_bucket(bucket, images, m
     assert has_mask
     assert [file["path"] for file in files] == [f"{bucket}/many/left.tif", "/vsis3/bucket/many/left.tif.msk"]
     assert all(file["etag"] for file in files)
-
-
-def test_identity__of_a_server_that_does_not_say_which_file_it_sends(web_server, images):
-    put(images, web_server.folder)
-    name = f"http://127.0.0.1:{web_server.server_address[1]}/left.tif"
-    assert identity(name)["etag"]
-    web_server.has_tags = False
-    with pytest.raises(SatIntervalsError, match=r"left.tif: its server sends neither ETag nor Last-Modified"):
-        identity(name)
 
 
 READ_TWICE = """import sys
@@ -306,12 +278,6 @@ def masked_image(server: ThreadingHTTPServer) -> str:
         with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=False):
             dataset.write_mask(np.eye(9, dtype=bool))
     return f"http://127.0.0.1:{server.server_address[1]}/left.tif"
-
-
-def test_read_window__sees_a_mask_on_a_server_whatever_the_users_options(web_server):
-    name, setting = masked_image(web_server), {"CPL_VSIL_CURL_ALLOWED_EXTENSIONS": ".tif"}
-    done = subprocess.run([sys.executable, "-c", STATE, name], env=os.environ | setting, capture_output=True, text=True)
-    assert done.stdout == "True\n"
 
 
 def test_read_window__sees_the_mask_of_a_server_that_is_busy_every_other_time(web_server):

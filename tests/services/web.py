@@ -31,8 +31,7 @@ class Handler(BaseHTTPRequestHandler):
         self.send_response(404 if not content else 206 if asked else 200)
         self.send_header("Content-Length", str(len(body)))
         self.send_header("Accept-Ranges", "bytes")
-        if self.server.has_tags:
-            self.send_header("ETag", f'"{hashlib.sha256(content).hexdigest()}"')
+        self.send_header("ETag", f'"{hashlib.sha256(content).hexdigest()}"')
         if asked:
             self.send_header("Content-Range", f"bytes {first}-{first + len(body) - 1}/{len(content)}")
         self.end_headers()
@@ -48,7 +47,7 @@ class Handler(BaseHTTPRequestHandler):
 def web_server(tmp_path) -> Iterator[ThreadingHTTPServer]:
     """A web server on loopback of the folder ``server.folder``; what it sent of which file is in ``server.sent``."""
     with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
-        server.folder, server.sent, server.has_tags = tmp_path / "web", [], True
+        server.folder, server.sent = tmp_path / "web", []
         server.is_busy = lambda path: False
         server.folder.mkdir()
         thread = threading.Thread(target=server.serve_forever)
