@@ -5,7 +5,6 @@ A block is a tile, or several small ones: reading, opening files and submitting 
 
 from collections import deque
 from collections.abc import Callable, Iterable
-from heapq import heappop, heappush
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,8 +18,6 @@ from sat_intervals.tiling import Grid, Tile
 
 # Blocks along each side of the grid, at least, if there are as many tiles: for several workers.
 _BLOCKS = 4
-# Blocks, at most, whose order `time_of` follows step by step, in about a second.
-_SIMULATED = 2000
 
 
 def blocks_of(grid: Grid, config: Config) -> Grid:
@@ -135,24 +132,6 @@ class Schedule:
 
 def _order(step: Step) -> tuple[int, int, int]:
     return step.block.grid_row, step.block.grid_column, -1 if step.wavefront is None else step.wavefront
-
-
-def time_of(blocks: Grid, workers: int, trace: float, match: float) -> float:
-    """Return the time that workers take for the steps of blocks, from that of tracing and of matching one block."""
-    if not trace or len(blocks) > _SIMULATED:
-        return len(blocks) * (LAST * trace + match) / workers
-    schedule, now, count = Schedule(blocks, blocks, set[str]().__contains__), 0.0, 0
-    queue, running = deque[Step](), list[tuple[float, int, Step]]()
-    while schedule:
-        # as in a run, two steps per worker are submitted
-        while len(queue) + len(running) < 2 * workers and (step := schedule.next()) is not None:
-            queue.append(step)
-        while queue and len(running) < workers:
-            step, count = queue.popleft(), count + 1
-            heappush(running, (now + (match if step.wavefront is None else trace), count, step))
-        now, _, step = heappop(running)
-        schedule.ended(step)
-    return now
 
 
 def handed_bytes(grid: Grid, config: Config, images: Iterable[Any], *, keeps_pixels: bool) -> int:

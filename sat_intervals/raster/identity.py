@@ -43,9 +43,7 @@ def identity(path: str, known: Mapping[str, Mapping[str, Any]] | None = None) ->
         if path.startswith((prefix, scheme)):
             return {"path": path} | object_tag(path.replace(prefix, scheme, 1))
     if not _NO_PATH.match(path):
-        raise ChangedInputError(
-            f"{path} cannot be read: it is missing, a folder, or a link to nothing: restore it"
-        )
+        raise ChangedInputError(f"{path} cannot be read: it is missing, a folder, or a link to nothing: restore it")
     return {"path": path}
 
 

@@ -1,18 +1,14 @@
 """Plan a run: tiles, work, memory, disk, and the time estimated from a sample."""
 
 import tempfile
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import fmean
 from typing import Any
 
 from sat_intervals.config import Cluster, Config, load_config, resolved
 from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.machine import usable_cores, usable_memory
 from sat_intervals.match.memory import PROCESS_BYTES, check_strips, fitted, strip_bytes, tile_bytes, waiting_bytes
-from sat_intervals.match.patch import Frame, path_window
-from sat_intervals.match.schedule import blocks_of, handed_bytes, time_of
+from sat_intervals.match.schedule import handed_bytes
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
 from sat_intervals.raster import BLOCK, Image, file_bytes, part_bytes
@@ -97,22 +93,10 @@ def plan(
     )
 
 
-def _traced(grid: Grid, whole: Window, config: Config) -> int:
-    """Return the pixels of the tiles that hand on path states, summed over the wavefronts but the last."""
-    ends = (grid.rows - 1, grid.columns - 1), (grid.rows - 1, 0), (0, 0)
-    corners = sum(_path_pixels(grid.tile(*end).core, grid.region, whole, config) for end in ends)
-    return len(ends) * _work(grid, whole, config) - corners
-
-
-def _path_pixels(core: Window, region: Window, whole: Window, config: Config) -> int:
-    window = path_window(Frame(core, region, whole), config)
-    return window.height * window.width
-
-
-def _work(grid: Grid, whole: Window, config: Config) -> int:
+def _work(grid: Grid, config: Config) -> int:
     """Return the pixels visited per SGM sweep, averaged over both: the patch without the rows after its core."""
     if config.tiles.overlap == "exact":
-        return _path_pixels(grid.region, grid.region, whole, config)
+        return grid.region.height * grid.region.width
 
     def patch(core: Window) -> Window:
         return core.grown(config.tiles.margin, config.tiles.margin).clipped(grid.region)
@@ -123,37 +107,26 @@ def _work(grid: Grid, whole: Window, config: Config) -> int:
 
 
 def _expected(left: Image, right: Image, config: Config, workers: int, grid: Grid) -> tuple[float, float]:
-    """Estimate the seconds of a run from samples, as many at once as there are workers, and its extra work."""
+    """Estimate the seconds of a run from a sample, and its extra work."""
     one = config.model_copy(update={"cluster": Cluster(workers=1)})  # also without the store of the run
     shape = SAMPLE, SAMPLE
     if config.hands_states_on:  # two tiles, since the sample needs a seam; whole ones, since each takes time of its own
         size = min(SAMPLE if config.cost.precomputed else 2 * SAMPLE, config.tiles.size)
         one = one.model_copy(update={"tiles": config.tiles.model_copy(update={"size": size})})
         shape = size, 2 * size
-    local = workers if config.cluster.kind in ("threads", "processes") else cores_of_process(config.cluster)
-    fitting = usable_memory() // (PROCESS_BYTES + tile_bytes(one))
-    together = range(max(1, min(local, usable_cores(), fitting)))
-    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(len(together)) as threads:
-        outs = [Path(folder) / f"sample{i}" for i in together]
-        samples = list(threads.map(lambda out: _sampled(left, right, out, one, grid.region, shape), outs))
-    window = samples[0][0]
-    seconds = {stage: fmean(each[stage] for _, each in samples) for stage in samples[0][1]}
-    sample = Grid(window, one.tiles.size)
-    pixels, sampled = (there.height * there.width for there in (grid.region, window))
-    whole = Window(0, 0, left.height, left.width)
-    work = _work(grid, whole, config)
+    with tempfile.TemporaryDirectory() as folder:
+        window, seconds = _sampled(left, right, Path(folder) / "sample", one, grid.region, shape)
+    pixels = grid.region.height * grid.region.width
+    larger = pixels / (window.height * window.width)
     of_tiles = sum(seconds.get(f"tiles.{stage}", 0.0) for stage in ("read", "pixels", "costs", "match", "write"))
-    tiles = of_tiles * work / _work(sample, whole, one)
-    # Of two tiles the first one's states of the last wavefront are traced, too: no tile is ready before.
-    traced = max(1, 4 * _traced(sample, whole, one) // 3)
-    paths = seconds.get("tiles.trace", 0.0) * _traced(grid, whole, config) / traced
-    strips = seconds["bands"] * pixels / sampled / min(workers, -(-grid.region.height // BLOCK))
-    files = seconds["files"] * pixels / sampled
-    images, inputs = seconds["tiles.images"], seconds["inputs"]  # the sample already reads whole images
-    blocks = blocks_of(grid, config)
-    parallel = time_of(blocks, min(workers, len(grid)), paths / max(1, 3 * len(blocks)), tiles / len(blocks))
+    work = _work(grid, config)
+    tiles = of_tiles * work / _work(Grid(window, one.tiles.size), one)
+    # In the sample one of two tiles hands states on, in four wavefronts; in the run all but the last do, in three.
+    paths = 1.5 * larger * seconds.get("tiles.trace", 0.0) * (1 - 1 / len(grid))
+    once = sum(seconds[stage] for stage in ("start", "kernels", "tiles.images", "inputs"))  # of whole images
+    strips = larger * seconds["bands"] / min(workers, -(-grid.region.height // BLOCK))
     extra = paths / tiles if config.hands_states_on else work / pixels - 1
-    return float(seconds["start"] + seconds["kernels"] + images + parallel + strips + inputs + files), extra
+    return once + (tiles + paths) / min(workers, len(grid)) + strips + larger * seconds["files"], extra
 
 
 def _sampled(

@@ -9,12 +9,14 @@ import statistics
 import subprocess
 import sys
 import tempfile
+from collections import deque
+from heapq import heappop, heappush
 from pathlib import Path
 
 from candidates import search_range
 
 from sat_intervals.demo import make_scene
-from sat_intervals.match.schedule import time_of
+from sat_intervals.match.schedule import Schedule
 from sat_intervals.raster import north_up, write_layer
 from sat_intervals.tiling import Grid, Window
 
@@ -65,6 +67,21 @@ def measured(folder):
             report = json.loads((folder / "out" / "run.json").read_text())
             found[name] = [*seconds, used.ru_utime + used.ru_stime], [*memory, used.ru_maxrss], report
     return found
+
+
+def time_of(grid, workers, trace, match):
+    """Time that workers take for all steps, from that of tracing and of matching one tile."""
+    schedule, now, count, queue, running = Schedule(grid, grid, set().__contains__), 0.0, 0, deque(), []
+    while schedule:
+        # as in a run, two steps per worker are submitted
+        while len(queue) + len(running) < 2 * workers and (step := schedule.next()) is not None:
+            queue.append(step)
+        while queue and len(running) < workers:
+            step, count = queue.popleft(), count + 1
+            heappush(running, (now + (match if step.wavefront is None else trace), count, step))
+        now, _, step = heappop(running)
+        schedule.ended(step)
+    return now
 
 
 def idle(grid, workers, trace, match):

@@ -4,7 +4,7 @@ import pytest
 
 from sat_intervals.config import load_config
 from sat_intervals.kernels.sgm import LAST
-from sat_intervals.match.schedule import Schedule, Step, blocks_of, needs, time_of
+from sat_intervals.match.schedule import Schedule, Step, blocks_of, needs
 from sat_intervals.tiling import Grid, Window
 
 GRID = Grid(Window(10, 20, 4 * 64, 5 * 64 - 7), 64)
@@ -157,12 +157,3 @@ def test_blocks_of__are_as_large_as_a_default_tile_and_at_least_four_along_a_sid
     assert (blocks.size, blocks.region) == (block, grid.region)
     inside = [tile for there in blocks for tile in grid.within(there.core)]
     assert len(inside) == len(set(inside)) == len(grid)
-
-
-def test_time_of__is_that_of_all_steps_for_one_worker_and_of_the_longest_chain_for_many():
-    assert time_of(GRID, 1, 1.0, 4.0) == 4 * 20 + 3 * 19
-    assert time_of(GRID, 1000, 1.0, 4.0) >= 7 + 4
-    assert time_of(GRID, 1, 1.0, 4.0) > time_of(GRID, 4, 1.0, 4.0) > time_of(GRID, 1, 1.0, 4.0) / 4
-    assert time_of(GRID, 4, 0.0, 4.0) == 20
-    many = Grid(Window(0, 0, 40 * 64, 40 * 64), 64)
-    assert time_of(many, 64, 0.085, 0.45) > 1.05 * time_of(many, 1, 0.085, 0.45) / 64
