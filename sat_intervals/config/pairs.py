@@ -6,18 +6,21 @@ import json
 import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import yaml
-from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
+from pydantic import BeforeValidator, Field, ValidationError
+from pydantic.dataclasses import dataclass
+from typing_extensions import TypedDict
 
-from sat_intervals.config.files import LARGEST_TABLE, load_yaml, read_small, set_by_name
+from sat_intervals.config.files import load_yaml, set_by_name
 from sat_intervals.errors import SatIntervalsError
 
 _FILES = ("left.tif", "right.tif", "truth.tif", "meta.json")
 _COLUMNS = ("left", "right", "truth", "minimum", "maximum")
+_TABLES = (".csv", ".yaml", ".yml", ".json")
 NO_GROUP = "all"
 
 # Report of a batch, in its folder. No pair may have its name or that of the folder of job logs.
@@ -26,18 +29,12 @@ _RESERVED = (REPORT, "logs")
 # Bytes of a pair's name: a folder's name has at most 255, and a store adds a digest.
 _LONGEST_NAME = 200
 _IMAGES = ("left", "right", "left_mask", "right_mask")
-_READING = {
-    f"{side}{what}": kind for what, kind in (("nodata", float), ("band", int)) for side in ("", "left_", "right_")
-}
+_SENSORS = ("left_model", "right_model", "left_grid", "right_grid")
 # Four integers, or text with them.
 _WINDOW = Annotated[
     tuple[int, int, int, int], BeforeValidator(lambda value: value.split() if isinstance(value, str) else value)
 ]
 _TOLERANCE = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-_SENSORS = ("left_model", "right_model", "left_grid", "right_grid")
-# YAML nodes allowed in a list of pairs, which may have thousands of rows.
-_NODES = 200_000
-_INTEGER = TypeAdapter(int)  # also of 14.0
 
 
 @dataclass(frozen=True)
@@ -54,18 +51,28 @@ class Pair:
     truth: Path
     minimum: int
     maximum: int
-    tolerance: float | None = None
+    tolerance: _TOLERANCE | None = None
     remove_bias: bool | None = None
+
+
+class Reading(TypedDict, total=False):
+    """No-data value and band of both images of a pair, or of one."""
+
+    nodata: float
+    band: int
+    left_nodata: float
+    right_nodata: float
+    left_band: int
+    right_band: int
 
 
 @dataclass(frozen=True)
 class PairOfBatch:
     """One row of a batch: name, images, and the pair's own settings as nested sections.
 
-    ``reading`` may have ``nodata`` and ``band`` for both images, ``left_nodata`` and so on for one; ``window`` is the
-    region of the left image to match: row, column, height, width. ``resolution`` is the side of a cell in metres of a
-    pair whose surface model is made too, and ``sensors`` are its models and grids of left and right; of raw images
-    both models, or None if they belong to the images.
+    ``window`` is the region of the left image to match: row, column, height, width. ``resolution`` is the side of a
+    cell in metres of a pair whose surface model is made too, and ``sensors`` are its models and grids of left and
+    right; of raw images both models, or None if they belong to the images.
     """
 
     name: str
@@ -74,27 +81,27 @@ class PairOfBatch:
     left_mask: str | None = None
     right_mask: str | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
-    reading: Mapping[str, Any] = field(default_factory=dict)
-    window: tuple[int, int, int, int] | None = None
+    reading: Reading = field(default_factory=Reading)
+    window: _WINDOW | None = None
     sensors: tuple[str, ...] | None = None
     resolution: float | None = None
 
 
 def is_pair(path: Path) -> bool:
-    """Return whether a path looks like the folder of a pair or a CSV file of pairs."""
-    return path.suffix == ".csv" or (path / "left.tif").exists()
+    """Return whether a path looks like the folder of a pair or a table of pairs."""
+    return path.suffix.lower() in _TABLES or (path / "left.tif").exists()
 
 
 def find_pairs(paths: Iterable[str | Path]) -> list[Pair]:
-    """Read pairs from folders and CSV files, in their order.
+    """Read pairs from folders and tables, in their order.
 
     A folder holds ``left.tif``, ``right.tif``, ``truth.tif`` and ``meta.json`` with ``disparity``, the search range
-    ``[minimum, maximum]``, and optionally ``group``. A CSV file has a header with the columns left, right, truth,
-    minimum, maximum and optionally name, group, tolerance and remove_bias; its paths are relative to the file.
+    ``[minimum, maximum]``, and optionally ``group``. A row of a table has left, right, truth, minimum, maximum and
+    optionally name, group, tolerance and remove_bias; see `read_batch` for tables.
     """
     pairs = []
     for path in map(Path, paths):
-        pairs += _of_table(path) if path.suffix == ".csv" else [_of_folder(path)]
+        pairs += _of_table(path) if path.suffix.lower() in _TABLES else [_of_folder(path)]
     check_names(pair.name for pair in pairs)
     nameless = (
         replace(pair, name="", group="", **{side: getattr(pair, side).resolve() for side in ("left", "right", "truth")})
@@ -135,9 +142,7 @@ def group_beside(image: str | Path) -> str:
 
 def _meta(file: Path) -> dict[str, Any]:
     try:
-        meta = json.loads(read_small(file).decode())
-    except SatIntervalsError:
-        raise
+        meta = json.loads(file.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
         raise SatIntervalsError(f"{file} cannot be read: {_why(error)}: it must be a JSON object") from error
     if not isinstance(meta, dict):
@@ -168,27 +173,20 @@ def _of_folder(folder: Path) -> Pair:
 def _of_table(file: Path) -> list[Pair]:
     pairs = []
     for place, row in _rows(file, _COLUMNS):
-        minimum, maximum = row["minimum"], row["maximum"]
-        try:
-            search = _INTEGER.validate_python(minimum), _INTEGER.validate_python(maximum)
-        except ValueError as error:
-            raise SatIntervalsError(f"{place}: minimum {minimum!r}, maximum {maximum!r}, needed: integers") from error
-        left, right, truth = (file.parent / row[image] for image in ("left", "right", "truth"))
-        named = row.get("name", row["left"]), row.get("group", NO_GROUP)
-        judging = _value(place, row, "tolerance", _TOLERANCE), _value(place, row, "remove_bias", bool)
-        pairs.append(Pair(*named, left, right, truth, *search, *judging))
+        row = {"name": row["left"], "group": NO_GROUP} | row
+        row |= {image: file.parent / row[image] for image in ("left", "right", "truth")}
+        pairs.append(_checked(place, Pair, {key: row[key] for key in Pair.__dataclass_fields__ if key in row}))
     return pairs
 
 
-def _value(place: str, row: dict[str, Any], key: str, kind: Any) -> Any:
-    """Take a value, or the text of one, out of a row; None if it has none."""
-    if (value := row.pop(key, None)) is None:
-        return None
+def _checked(place: str, kind: type[Any], values: dict[str, Any]) -> Any:
+    """Return a pair of checked values."""
     try:
-        return TypeAdapter(kind).validate_python(value)
+        return kind(**values)
     except ValidationError as error:
-        why = error.errors(include_url=False)[0]["msg"].lower()
-        raise SatIntervalsError(f"{place}: {key} is {value!r}: {why}") from error
+        problem = error.errors(include_url=False)[0]
+        key = [name for name in problem["loc"] if isinstance(name, str)][-1]
+        raise SatIntervalsError(f"{place}: {key} is {problem['input']!r}: {problem['msg'].lower()}") from error
 
 
 def _of_batch(place: str, row: dict[str, Any], file: Path) -> PairOfBatch:
@@ -200,10 +198,11 @@ def _of_batch(place: str, row: dict[str, Any], file: Path) -> PairOfBatch:
         raise SatIntervalsError(
             f"{place}: name {name!r} cannot be a folder's name: choose another of at most {_LONGEST_NAME} bytes"
         )
-    images: dict[str, Any] = {key: _relative_to(file, str(row.pop(key))) for key in _IMAGES if key in row}
-    reading = {key: _value(place, row, key, kind) for key, kind in _READING.items() if key in row}
-    window = _value(place, row, "window", _WINDOW)
-    surface = _surface(place, row, file)
+    values: dict[str, Any] = {key: _relative_to(file, str(row.pop(key))) for key in _IMAGES if key in row}
+    values["reading"] = {key: row.pop(key) for key in Reading.__annotations__ if key in row}
+    sensors = {key: _relative_to(file, str(row.pop(key))) for key in _SENSORS if key in row}
+    values |= {key: row.pop(key, None) for key in ("window", "resolution")}
+    _check_surface(place, sensors, values["resolution"])
     settings: dict[str, Any] = {}
     for key, value in row.items():
         try:
@@ -211,22 +210,21 @@ def _of_batch(place: str, row: dict[str, Any], file: Path) -> PairOfBatch:
             set_by_name(settings, name_of_setting, load_yaml(value) if isinstance(value, str) else value)
         except (ValueError, RecursionError, yaml.YAMLError) as error:
             raise SatIntervalsError(f"{place}: {key} is {value!r}: {_why(error)}") from error
-    return PairOfBatch(name, settings=settings, reading=reading, window=window, **images, **surface)
+    values |= {"name": name, "settings": settings, "sensors": tuple(sensors.values()) or None}
+    pair: PairOfBatch = _checked(place, PairOfBatch, values)
+    return pair
 
 
-def _surface(place: str, row: dict[str, Any], file: Path) -> dict[str, Any]:
-    """Take what a surface model needs out of a row, all or nothing."""
-    given = {key: _relative_to(file, str(row.pop(key))) for key in _SENSORS if key in row}
-    resolution = _value(place, row, "resolution", float)
-    if not given and resolution is None:
-        return {}
+def _check_surface(place: str, sensors: Mapping[str, str], resolution: Any) -> None:
+    """Raise unless a row has all that a surface model needs, or nothing of it."""
+    if not sensors and resolution is None:
+        return
     # raw images have no grids, and perhaps models beside them
-    needed = _SENSORS if any(key.endswith("grid") for key in given) else _SENSORS[:2] if given else ()
-    missing = [key for key in needed if key not in given] + ["resolution"] * (resolution is None)
+    needed = _SENSORS if any(key.endswith("grid") for key in sensors) else _SENSORS[:2] if sensors else ()
+    missing = [key for key in needed if key not in sensors] + ["resolution"] * (resolution is None)
     if missing:
         needed = (*needed, "resolution")
         raise SatIntervalsError(f"{place} lacks {' and '.join(missing)}: a surface needs {', '.join(needed)}")
-    return {"sensors": tuple(given.values()) or None, "resolution": resolution}
 
 
 def _relative_to(file: Path, path: str) -> str:
@@ -237,12 +235,8 @@ def _rows(file: Path, needed: Sequence[str]) -> list[tuple[str, dict[str, Any]]]
     """Read the rows of a CSV, YAML or JSON file without empty values; each comes after its place in the file."""
     wanted = f"give a list of pairs, each with {', '.join(needed)}"
     try:
-        if file.suffix.lower() == ".csv":
-            rows = _rows_of_csv(read_small(file, LARGEST_TABLE).decode("utf-8-sig"))  # with a byte order mark
-        else:
-            rows = load_yaml(read_small(file).decode("utf-8-sig"), _NODES)
-    except SatIntervalsError:
-        raise
+        text = file.read_bytes().decode("utf-8-sig")  # with a byte order mark
+        rows = _rows_of_csv(text) if file.suffix.lower() == ".csv" else load_yaml(text)
     except (OSError, ValueError, RecursionError, yaml.YAMLError, csv.Error) as error:
         raise SatIntervalsError(f"{file} cannot be read: {_why(error)}: {wanted}") from error
     if not isinstance(rows, list) or not rows or not all(isinstance(row, Mapping) for row in rows):

@@ -9,8 +9,6 @@ from sat_intervals.errors import SatIntervalsError
 _DISTRIBUTION = "MCCNN"
 NETWORKS = {"full": "mc_cnn_fast_int8_excl_01.onnx", "depthwise": "mc_cnn_fast_dw.onnx"}
 INSTALL_MCCNN = "pip install 'sat-intervals[mccnn]'"
-# Largest file of weights in bytes; the official one has 0.4 MB.
-_LARGEST = 256 * 10**6
 _NAMES = " or ".join(NETWORKS)
 
 
@@ -19,12 +17,6 @@ def weights_file(weights: str) -> Path:
     if weights not in NETWORKS:
         if not Path(weights).is_file():
             raise SatIntervalsError(f"cost.weights {weights}: no such file: name an ONNX network, or {_NAMES}")
-        size = Path(weights).stat().st_size
-        if size > _LARGEST:
-            raise SatIntervalsError(
-                f"cost.weights {weights} has {size / 1e6:.0f} MB, a network like MC-CNN has less than "
-                f"{_LARGEST / 1e6:.0f} MB: name an ONNX network, or {_NAMES}"
-            )
         return Path(weights).resolve()
     try:
         found = [file for file in files(_DISTRIBUTION) or [] if file.name == NETWORKS[weights]]

@@ -148,7 +148,9 @@ def _files(name: str) -> list[str]:
 
 def _prepared(pair: PairOfBatch, out: Path, settings: Config, *, overwrite: bool, find: Finder) -> Job:
     def opened(side: str, path: str, mask: str | None) -> Image:
-        options = {name: pair.reading.get(f"{side}_{name}", pair.reading.get(name)) for name in ("band", "nodata")}
+        options: dict[str, Any] = {
+            name: pair.reading.get(f"{side}_{name}", pair.reading.get(name)) for name in ("band", "nodata")
+        }
         return open_image(path, **options, mask=mask)
 
     left, right = opened("left", pair.left, pair.left_mask), opened("right", pair.right, pair.right_mask)

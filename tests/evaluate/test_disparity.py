@@ -307,7 +307,7 @@ PAIR = "left,right,truth,minimum,maximum"
         ),
         ("pairs.csv", f"{PAIR}\n", "pairs.csv holds no pairs: give a list of pairs, each with left, right"),
         ("pairs.csv", f"{PAIR},name\na,b,c,1,2,x\n./a,b,c,1,2,y\n", "/a is given 2 times: give it once"),
-        ("pairs.csv", f"{PAIR}\na,b,c,1,x\n", "row 1: minimum '1', maximum 'x', needed: integers"),
+        ("pairs.csv", f"{PAIR}\na,b,c,1,x\n", "row 1: maximum is 'x': input should be a valid integer"),
         ("pairs.csv", f"{PAIR}\na,b,c,1,2\na,d,e,3,4\n", "2 pairs or runs are called a: give each its own name"),
     ],
 )
