@@ -8,7 +8,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from sat_intervals.evaluate.paper import ACCURACY, OBJECTIVE, Row, SceneMetrics, look_up, table_1
+from sat_intervals.evaluate.paper import ACCURACY, OBJECTIVE, TABLE_1, SceneMetrics, look_up, table_1
 
 if TYPE_CHECKING:
     from sat_intervals.config import Calibration
@@ -35,24 +35,13 @@ def show(header: Sequence[str], rows: Sequence[Sequence[str]], title: str) -> No
     terminal.print(table)
 
 
-def show_groups(rows: Sequence[Row], title: str) -> None:
-    """Print one of the paper's tables: a row per group, followed by published figures for comparison."""
-    header = ["", "scenes", f">= {OBJECTIVE}", *rows[0].figures]
-    cells = []
-    for row in rows:
-        own = [row.label, str(row.scenes), str(row.at_objective)] if row.scenes else [f"  {row.label}", "", ""]
-        cells.append([*own, *map(_figure, row.figures.values())])
-    show(header, cells, title)
-    if any(row.scenes is None for row in rows):
-        click.echo(
-            "paper: Malinowski et al. 2024; reference: their implementation in Pandora, measured for this project; it "
-            "cross-checks as with cross_check.method accurate"
-        )
-
-
 def show_scenes(scenes: Sequence[SceneMetrics]) -> None:
     """Print the paper's table 1, and each scene's coverage beside the one asked for, with widths and scores."""
-    show_groups(table_1(scenes), "means over scenes, valid pixels")
+    groups = [
+        [row.label, str(row.scenes), str(row.at_objective), *map(_figure, row.figures.values())]
+        for row in table_1(scenes)
+    ]
+    show(["", "scenes", f">= {OBJECTIVE}", *TABLE_1], groups, "means over scenes, valid pixels")
     _show_missed(scenes)
     paths = [
         ("nominal",), ("all", "accuracy"), ("high", "accuracy"), ("low", "accuracy"), ("all", "mean_width"),
