@@ -97,7 +97,7 @@ def calibrate(
     from sat_intervals.run.measure import measure_subjects
 
     subjects = _subjects(pairs, truth, _Judging(settings, **judging))
-    _check_kept(settings, [*_inputs(subjects, pairs), *truth], output)
+    _check_kept(settings, subjects, [*pairs, *truth], output)
     check_output(output, overwrite=overwrite)
     folder = output.absolute().parent
     check_subjects(subjects)
@@ -112,13 +112,15 @@ def calibrate(
         click.echo(str(output))
 
 
-def _check_kept(settings: SettingsArguments, read: Sequence[str | Path], output: Path) -> None:
-    """Raise if the output is an input, or a file that the settings name."""
+def _check_kept(settings: SettingsArguments, subjects: "list[Subject]", given: Sequence[Path], output: Path) -> None:
+    """Raise if the output is an input, describes one, or is a file that the settings name."""
     from sat_intervals.config import named_files, read_yaml
     from sat_intervals.raster.identity import check_not_replaced
 
     named = named_files(read_yaml(settings.file)) if settings.file else []
-    check_not_replaced([*read, settings.file, *named], [output])
+    read = [file for one in subjects for file in (one.left.path, one.right.path, one.truth.image.path)]
+    described = [one / name for one in given for name in ("meta.json", "run.json")]
+    check_not_replaced([*read, *given, *described, settings.file, *named], [output])
 
 
 @dataclass(frozen=True)
@@ -139,13 +141,6 @@ def _subjects(paths: tuple[Path, ...], truths: tuple[Path, ...], judging: _Judgi
         else _of_run(Path(source.name), source.truth, judging)
         for source in find_sources(paths, truths)
     ]
-
-
-def _inputs(subjects: "list[Subject]", pairs: tuple[Path, ...]) -> list[str | Path]:
-    """Return images and truths, and files that describe pairs."""
-    described = [file for one in pairs for file in (one, one / "meta.json", one / "run.json") if file.is_file()]
-    files = [file for one in subjects for file in (one.left.path, one.right.path, one.truth.image.path)]
-    return [*files, *described]
 
 
 def _of_pair(pair: "Pair", truth: Path | None, judging: _Judging) -> "Subject":

@@ -4,7 +4,6 @@ import hashlib
 import os
 import re
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from datetime import UTC, datetime
 from http.client import HTTPException
 from pathlib import Path
@@ -80,29 +79,17 @@ def _of_url(url: str) -> dict[str, Any]:
 def check_not_replaced(
     inputs: Iterable[str | Path | None], outputs: Iterable[str | Path], folders: Iterable[str | Path] = ()
 ) -> None:
-    """Raise if an output, or a file in one of the ``folders``, is also an input; links and other names count.
-
-    Remote inputs and None are ignored.
-    """
-    written = {key: output for output in outputs for key in identifiers(output)}
+    """Raise if an output, or a file in one of the ``folders``, is also an input, or a link to it; None is ignored."""
+    written = {os.path.realpath(output): output for output in outputs}
     parents = {os.path.realpath(folder) for folder in folders}
     for name in inputs:
         file = name if name is None or os.path.exists(name) else local_file(os.fspath(name))
         if file is None:
             continue
-        for found in identifiers(file) & written.keys():
-            raise SatIntervalsError(f"{name} is an input, and {written[found]} would be written: choose another output")
+        if found := written.get(os.path.realpath(file)):
+            raise SatIntervalsError(f"{name} is an input, and {found} would be written: choose another output")
         for folder in map(str, Path(os.path.realpath(file)).parents):
             if folder in parents:
                 raise SatIntervalsError(
                     f"{name} is an input inside {folder}, whose files are written and deleted: choose another output"
                 )
-
-
-def identifiers(file: str | Path) -> set[object]:
-    """Return the path of a file without links and, if it exists, what it has in common with its hard links."""
-    found: set[object] = {os.path.realpath(file)}
-    with suppress(OSError):
-        status = os.stat(file)
-        found.add((status.st_dev, status.st_ino))
-    return found
