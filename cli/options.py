@@ -2,7 +2,6 @@
 
 import json
 import math
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import wraps
@@ -24,12 +23,9 @@ PICTURES = ("overview", "errors", "coverage", "range", "rows", "profile", "curve
 Command = Callable[..., Any]
 Decorator = Callable[[Command], Command]
 
-# What rasterio takes for an address, even if there is a folder with this name.
-_ADDRESS = re.compile(r"(file|https?|ftp|s3|gs|az|oss|zip|tar|gzip)(\+\w+)*:", re.IGNORECASE)
-
 
 class _Name(click.ParamType):  # type: ignore[type-arg,unused-ignore]
-    """A name that GDAL can open: UTF-8, and not empty, as from an unset shell variable; or a path of this machine."""
+    """A name that GDAL can open, not empty, as from an unset shell variable; or a path of this machine."""
 
     name = "file"
 
@@ -39,12 +35,6 @@ class _Name(click.ParamType):  # type: ignore[type-arg,unused-ignore]
     def convert(self, value: Any, parameter: click.Parameter | None, context: click.Context | None) -> Any:
         if value == "":
             self.fail("it is empty: give a file or folder", parameter, context)
-        try:
-            str(value).encode()
-        except UnicodeEncodeError:
-            self.fail(f"{value!r} is not UTF-8: rename it", parameter, context)
-        if self._is_path and _ADDRESS.match(str(value)):
-            self.fail(f"{value} is read as an address: give the path of a file or folder here", parameter, context)
         return Path(value) if self._is_path else value
 
     def shell_complete(

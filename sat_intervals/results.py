@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import AliasPath, BaseModel, Field, ValidationError
 
 from sat_intervals.config import Config, Regularization, load_config
 from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.kernels.rows import RowOffsets
-from sat_intervals.products import BANDS, Bands, interval_bands
+from sat_intervals.products import BANDS, Bands
 from sat_intervals.raster import Georeferencing, Image, check_not_replaced, open_image, read_layers, read_tags
 from sat_intervals.raster.images import opened
 from sat_intervals.raster.published import is_surface_of, tags_beside
@@ -32,17 +31,6 @@ _ADDED: dict[str, tuple[str, Callable[[Path, str], bool]]] = {
 }
 
 _LOG = logging.getLogger(__name__)
-
-
-class _Report(BaseModel):
-    """What is read of ``run.json``."""
-
-    finished: str
-    settings: dict[str, Any]
-    counts: dict[str, Any]
-    left: dict[str, Any] = Field(validation_alias=AliasPath("inputs", "left"))
-    right: dict[str, Any] = Field(validation_alias=AliasPath("inputs", "right"))
-    region: Window = Field(validation_alias=AliasPath("tiles", "region"))
 
 
 @dataclass(frozen=True)
@@ -173,18 +161,18 @@ def open_run(out: str | Path) -> Run:
     file = Path(out) / "run.json"
     try:
         report = json.loads(file.read_bytes())
-        region = _Report.model_validate(report).region
+        region = Window(**report["tiles"]["region"])
         config = load_config(report["settings"])
     except OSError as error:
         raise SatIntervalsError(f"{file}: {error.strerror}: give the folder of a finished run") from error
     except SatIntervalsError as error:
         raise SatIntervalsError(f"{file}: {error}: made by another version, match again with --overwrite") from error
-    except ValueError as error:
-        where = ", see " + ".".join(map(str, error.errors()[0]["loc"])) if isinstance(error, ValidationError) else ""
-        raise SatIntervalsError(f"{file} is not the report of a run{where}: match again with --overwrite") from error
-    counts = {**_BANDS, "intervals.tif": len(interval_bands(config.extra_bands))}
-    places = [_place(file.with_name(name), (n, region.height, region.width)) for name, n in counts.items()]
-    return Run(file.parent, report, config, region, places[-1])
+    except (ValueError, LookupError, TypeError) as error:
+        raise SatIntervalsError(f"{file} is not the report of a run: match again with --overwrite") from error
+    for name in _BANDS:
+        check_file(file.with_name(name), "give the folder of a finished run, or match with --overwrite")
+    with opened(str(file.with_name("validity.tif"))) as dataset:
+        return Run(file.parent, report, config, region, Georeferencing.of(dataset))
 
 
 def paths_of(inputs: Any) -> Iterator[str]:
@@ -193,17 +181,6 @@ def paths_of(inputs: Any) -> Iterator[str]:
         yield from paths_of(value)
     if isinstance(inputs, dict) and "path" in inputs:
         yield inputs["path"]
-
-
-def _place(file: Path, needed: tuple[int, int, int]) -> Georeferencing:
-    """Return the georeferencing of a raster; raise if it is missing, or has other bands, rows and columns."""
-    check_file(file, "give the folder of a finished run, or match with --overwrite")
-    with opened(str(file)) as dataset:
-        found, place = (dataset.count, *dataset.shape), Georeferencing.of(dataset)
-    if found != needed:
-        has, says = (f"{count} bands of {height} x {width}" for count, height, width in (found, needed))
-        raise SatIntervalsError(f"{file} has {has} pixels, run.json says {says}: match again with --overwrite")
-    return place
 
 
 def open_results(out: str | Path, truth: str | Path | None = None) -> Results:
@@ -221,8 +198,4 @@ def open_input(record: dict[str, Any]) -> Image:
     if name.startswith("/") and not name.startswith("/vsi") and not Path(name).exists():
         raise SatIntervalsError(f"{name}, an image of the run, is missing: move it back, or put a link to it there")
     nodata = None if nodata is None else float(nodata)
-    image = open_image(name, band=record["band"], nodata=nodata, mask=mask and mask["path"])
-    if (image.height, image.width) != (record["height"], record["width"]):
-        sizes = f"{image.height} x {image.width} pixels, but had {record['height']} x {record['width']}"
-        raise SatIntervalsError(f"{name} has {sizes} when it was matched: restore it")
-    return image
+    return open_image(name, band=record["band"], nodata=nodata, mask=mask and mask["path"])
