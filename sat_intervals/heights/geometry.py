@@ -60,11 +60,6 @@ def set_geometry(
     ``median_residual``, the median distance (metres) between lines of sight at some positions across the region, far
     below 0.1 m if models and grids belong to these images, for any disparities; ``beyond``, the number of pixels by
     which the left grid reaches beyond the left image, and the ``grid_step`` in pixels.
-
-    Raises
-    ------
-    SatIntervalsError
-        The folder is not a run, or models or grids cannot be read or do not fit.
     """
     run = out if isinstance(out, Run) else open_run(out)
     paths = [Path(file) for file in (left_model, right_model, left_grid, right_grid)]

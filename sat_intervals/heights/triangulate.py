@@ -50,11 +50,6 @@ def triangulate(
     -------
     ``points``, the number of points; if there are any, minimum and maximum of ``height`` (metres above the ellipsoid);
     the figures of `set_geometry`, and ``lost``, the share of the region where grids or models have no values.
-
-    Raises
-    ------
-    SatIntervalsError
-        The folder is not a run or has no models and grids, or the file cannot be written.
     """
     run = out if isinstance(out, Run) else open_run(out)
     path = run.out / "points.tif" if path is None else Path(path)
