@@ -1,20 +1,14 @@
 """Memory and cores in containers and jobs: made-up trees of cgroups of both versions, and the kernel's own limits."""
 
 import os
-import re
 import resource
 import subprocess
 import sys
-from contextlib import suppress
 from functools import partial
-from pathlib import Path
 
-import numpy as np
 import pytest
-from helpers import COMMAND
 
 from sat_intervals import machine
-from sat_intervals.raster import north_up, write_layer
 
 GB = 10**9
 PHYSICAL = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
@@ -116,59 +110,3 @@ def test_usable_memory__is_at_most_the_address_space():
 
 def test_usable_cores__are_at_most_those_of_the_affinity():
     assert printed("usable_cores", partial(os.sched_setaffinity, 0, {min(os.sched_getaffinity(0))})) == 1
-
-
-def real_cgroup(controller):
-    """A new cgroup below that of this process; None if it cannot be made."""
-    above = list(machine._cgroups(Path("/"), controller))
-    if above and above[0].parent not in above:  # others belong to the service that made them, with all below
-        folder = above[0] / f"sat_intervals_{os.getpid()}"
-        with suppress(OSError):
-            folder.mkdir()
-            return folder
-    return None
-
-
-@pytest.mark.process
-@pytest.mark.parametrize(
-    ("controller", "limits", "what", "expected"),
-    [
-        ("memory", {"memory.max": 2**28, "memory.limit_in_bytes": 2**28}, "usable_memory", 2**28),
-        ("cpu", {"cpu.max": "90000 100000", "cpu.cfs_quota_us": 90000}, "usable_cores", 1),
-    ],
-)
-def test_usable_memory_and_cores__are_at_most_those_of_a_cgroup(tmp_path, controller, limits, what, expected):
-    """A real cgroup if possible, else one of a made-up tree."""
-    folder = real_cgroup(controller)
-    known = {folder / name: text for name, text in limits.items() if folder and (folder / name).exists()}
-    try:
-        for file, text in known.items():
-            file.write_text(str(text))
-        if known:
-            found = printed(what, lambda: (folder / "cgroup.procs").write_text(str(os.getpid())))
-        else:
-            inside = {f"a/{name}": text for name, text in limits.items()}
-            found = printed(what, root=made_up(tmp_path, "0::/a", inside))
-    finally:
-        if folder:
-            folder.rmdir()
-    assert found == expected
-
-
-@pytest.mark.process
-def test_match__refuses_tiles_that_do_not_fit_in_what_a_job_may_use(tmp_path):
-    write_layer(tmp_path / "image.tif", np.ones((4096, 4096), np.uint8), 0, north_up(32631, 0, 0, 0.5))
-    pair = [tmp_path / "image.tif", tmp_path / "image.tif", tmp_path / "out", "--disparity", "-255", "0"]
-    may = 8 * 10**9
-    done = subprocess.run(
-        [COMMAND, "match", *pair, "--tile-size", "4096", "--workers", "1"],
-        preexec_fn=partial(resource.setrlimit, resource.RLIMIT_AS, (may, may)),
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert done.returncode == 2
-    refusal = r"4096 x 4096 pixels x 256 disparities, 1 at once, need 8\.6 GB, this process may use (.*) GB:"
-    said = re.search(refusal, done.stderr)
-    assert said, done.stderr
-    assert float(said[1]) <= may / 1e9

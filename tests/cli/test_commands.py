@@ -16,18 +16,17 @@ import click
 import numpy as np
 import pytest
 import rasterio
-import xarray as xr
 import yaml
 from helpers import COMMAND, LOCK, OUTPUTS, PATIENCE, hashes, invoke, wait_until
 from rasterio.errors import NotGeoreferencedWarning
 from rio_cogeo.cogeo import cog_validate
 
-from sat_intervals import load_config, match_arrays
+from sat_intervals import load_config
 from sat_intervals.cli import main, options
 from sat_intervals.config import PRESETS, preset_text, resolved
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError
-from sat_intervals.products import BANDS, FLAGS, INVALID
+from sat_intervals.products import FLAGS, INVALID
 
 HALF_METRE = rasterio.Affine(0.5, 0, 300000, 0, -0.5, 4800000)
 NOWHERE = {"crs": None, "transform": None}
@@ -116,25 +115,6 @@ def done(folder, tmp_path_factory):
 
 
 # ---- What is refused before a pixel is read -------------------------------------------------------------------
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        ({"left": "absent.tif"}, ["absent.tif cannot be read: No such file or directory: give the path"]),
-        ({"right": "absent.tif"}, ["absent.tif cannot be read: No such file or directory: give the path"]),
-        ({"left": "."}, ["not recognized as being in a supported file format: give the path of a raster"]),
-        ({"right": "nothing.tif"}, ["nothing.tif cannot be read: ", "give the path of a raster"]),
-        ({"right": "text.tif"}, ["text.tif cannot be read: ", "give the path of a raster"]),
-        ({"right": "lower.tif"}, ["left.tif and ", "lower.tif have 200 and 150 rows", "resample the pair together"]),
-        ({"right": "zone.tif"}, ["left.tif", "zone.tif have different CRS, EPSG:32631 and EPSG:32632", "resample"]),
-        ({"right": "metre.tif"}, ["metre.tif have different pixel sizes, 0.5 x 0.5 and 1 x 1", "resample"]),
-        ({"right": "complex.tif"}, ["complex.tif: band 1 is complex64", "give its amplitude"]),
-        ({"right": "bands.tif"}, ["bands.tif has bands 1 to 3: give a file of one band"]),
-    ],
-    ids=lambda value: "-".join(value.values()) if isinstance(value, dict) else "",
-)
-def test_match__refuses_images_that_are_no_pair(folder, tmp_path, arguments, says):
-    assert_refused(invoke(*matching(folder, tmp_path / "out", **arguments)), *says)
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
@@ -185,67 +165,11 @@ def test_match__refuses_options_that_do_not_suit_the_pair(folder, tmp_path, opti
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ("sgn: {p1: 8}", "unknown key 'sgn', did you mean sgm? (known: preset, disparity, rows, cost, sgm, "),
-        ("sgm: {p3: 8}", "unknown key 'sgm.p3' (known: penalty, p1, p2, span)"),
-        ("sgm: {p1: eight}", "sgm.p1 is 'eight', allowed: number > 0"),
-        ("sgm: {p1: 150}", "sgm: p1 150 is above p2 144"),
-        ("interval: {alpha: 1.5}", "interval.alpha is 1.5, allowed: number > 0, <= 1"),
-        ("cost: null", "cost is null, allowed: section of method, window"),
-        ("median: {size: 4}", "median.size is 4, allowed: integer >= 3"),
-        ("interval: null", "regularization needs interval, set to null"),
-        ("sgm: {p1: 8, p1: 9}", "line 1: key 'p1' appears twice"),
-        ("- sgm", "holds ['sgm'], allowed: sections preset, disparity, "),
-        ("sgm: {", "line 1: "),
-        ("disparity: {minimum: 3}", "disparity: minimum is 3, maximum is auto: give two numbers, or auto twice"),
-    ],
-)
-def test_match__refuses_settings_that_it_does_not_know(folder, tmp_path, text, says):
-    (tmp_path / "settings.yaml").write_text(text)
-    options = [] if text.startswith("disparity") else ["--disparity", "-9", "9"]
-    result = invoke(*matching(folder, tmp_path / "out", *options, config=tmp_path / "settings.yaml"))
-    assert_refused(result, f"{tmp_path / 'settings.yaml'}: ", says)
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.parametrize("place", [0, 1, 2])
 def test_match__refuses_empty_names(folder, tmp_path, place):
     arguments = matching(folder, tmp_path / "out")
     arguments[1 + place] = ""
     assert_refused(invoke(*arguments), f"'{('LEFT', 'RIGHT', 'OUT')[place]}': it is empty: give a file or folder")
-
-
-def test_match__refuses_names_that_are_not_utf8(folder, tmp_path):
-    name = os.fsdecode(b"left\xff.tif")
-    assert_refused(invoke("match", name, folder / "right.tif", tmp_path), "is not UTF-8: rename it")
-
-
-@pytest.mark.parametrize("name", ["", os.fsdecode(b"out\xff")])
-@pytest.mark.parametrize("command", ["dsm", "evaluate", "plot", "report", "status"])
-def test_commands__refuse_folders_without_a_name_or_not_utf8(command, name):
-    assert_refused(invoke(command, name), "it is empty: give a" if name == "" else "is not UTF-8: rename it")
-
-
-def test_match__notices_swapped_arguments(folder, tmp_path):
-    result = invoke("match", tmp_path / "out", folder / "left.tif", folder / "right.tif", "--disparity", "-9", "9")
-    assert_refused(result, "out cannot be read: No such file or directory")
-
-
-@pytest.mark.parametrize("more", [[], ["--overwrite"]])
-def test_match__names_a_folder_in_the_place_of_a_result(folder, tmp_path, more):
-    (tmp_path / "out" / "validity.tif").mkdir(parents=True)
-    result = invoke(*matching(folder, tmp_path / "out", *more))
-    assert_refused(result, "out/validity.tif is a folder: move it away or choose another folder")
-    assert [*(tmp_path / "out").iterdir()] == [tmp_path / "out" / "validity.tif"]
-
-
-@pytest.mark.parametrize("name", ["file:out", "S3:", "zip+https://out"])
-def test_match__refuses_an_output_whose_name_is_an_address(folder, tmp_path, monkeypatch, name):
-    monkeypatch.chdir(tmp_path)
-    assert_refused(invoke(*matching(folder, name)), f"{name} is read as an address: give the path of a file or folder")
-    assert not [*tmp_path.iterdir()]
 
 
 @pytest.mark.parametrize(
@@ -264,26 +188,6 @@ def test_match__refuses_an_output_that_cannot_be_written(folder, place, says):
     before = sorted(folder.iterdir())
     assert_refused(invoke(*matching(folder, place.format(folder))), says)
     assert sorted(folder.iterdir()) == before
-
-
-def test_match__refuses_a_folder_that_holds_a_run(folder, done):
-    out, _ = done
-    before = hashes(out)
-    result = invoke(*matching(folder, out))
-    assert_refused(result, f"{out} already holds another run: ", "choose another folder or --overwrite")
-    assert hashes(out) == before
-
-
-def test_match__refuses_tiles_that_the_machine_cannot_hold(folder, tmp_path):
-    place = {"count": 1, "height": 150_000, "width": 150_000, "dtype": "uint8", "tiled": True, "sparse_ok": True}
-    with rasterio.open(tmp_path / "huge.tif", "w", driver="GTiff", transform=HALF_METRE, **place):
-        pass  # no block is written
-    result = invoke(
-        *matching(folder, tmp_path / "out", left=tmp_path / "huge.tif", right=tmp_path / "huge.tif"),
-        *("--tile-size", 16384, "--disparity", -8191, 0, "--workers", 1),
-    )
-    assert_refused(result, "16384 x 16384 pixels x 8192 disparities, 1 at once, need 4398.0 GB, this process may use")
-    assert not (tmp_path / "out").exists()
 
 
 # ---- What shows itself on the way -----------------------------------------------------------------------------
@@ -314,29 +218,6 @@ def test_match__says_why_no_pixel_can_be_matched(folder, tmp_path, arguments, op
     assert_refused(result, "no pixel of ", says.format(folder), "check no-data values, masks, window and search range")
     assert result.stdout == ""
     assert_nothing_final(tmp_path / "out")
-
-
-@pytest.mark.process
-@pytest.mark.parametrize("cluster", ["threads", "processes"])
-def test_match__names_the_tiles_that_a_truncated_file_fails(folder, tmp_path, cluster):
-    """The lower half of the left image is gone: the three lower of five rows of tiles with their overlap."""
-    out = tmp_path / "out"
-    options = ["--tile-size", 64, "--set", "tiles.overlap=5", "--quiet", "--cluster", cluster, "--workers", 2]
-    result = command(*matching(folder, out, *options, left="cut.tif"))
-    assert (result.returncode, result.stdout) == (1, "")
-    first, *lines = result.stderr.splitlines()
-    assert re.fullmatch(
-        r"sat-intervals: (\d+) of 20 tiles failed, .*rerun the same command: it resumes; add --ov.*:", first
-    )
-    assert int(first.split()[1]) == len(lines)
-    failed = {re.fullmatch(r"  tile (\d_\d): (.*)", line)[1] for line in lines}
-    kept = {path.stem for path in (out / "tiles" / "tiles").glob("[0-9]*.npz")}
-    assert failed | kept == {f"{row}_{column}" for row in range(4) for column in range(5)}
-    assert not failed & kept
-    assert {"0_0", "0_4"} <= kept
-    assert {"2_0", "3_4"} <= failed
-    assert all(f"{folder / 'cut.tif'} cannot be read at rows " in line for line in lines)
-    assert_nothing_final(out)
 
 
 def test_match__shows_a_traceback_only_when_asked(folder, tmp_path):
@@ -546,28 +427,6 @@ def test_match__interrupted_at_a_terminal_hears_nothing_of_its_workers(folder, t
     assert_nothing_final(out)
 
 
-def test_match__on_a_disk_without_room_for_the_files_is_refused_and_goes_on_once_there_is_room(folder, tmp_path, disk):
-    out, settings = disk(20 << 20) / "out", tmp_path / "settings.yaml"
-    settings.write_text("products: {compression: zstd}\n")
-    size = ("--tile-size", 64, "--set", "tiles.overlap=20")
-    arguments = matching(folder, out, *size, "--quiet", "--keep-tiles", "--config", settings)
-    command(*arguments)
-    before = hashes(out)
-    for name in OUTPUTS:  # as if it had ended before them
-        (out / name).unlink()
-    space = os.statvfs(out)
-    ballast = out.parent / "ballast"
-    ballast.write_bytes(bytes(space.f_bfree * space.f_frsize - 970_000))
-    full = command(*arguments)
-    assert (full.returncode, full.stdout) == (2, "")
-    assert re.search(r"has [01]\.\d MB free, tiles, .* may need \d\.\d MB: free disk space", full.stderr)
-    assert sorted(path.name for path in out.iterdir()) == [LOCK, "tiles"]
-    ballast.unlink()
-    again = command(*arguments)
-    assert (again.returncode, again.stdout, again.stderr) == (0, "", "")
-    assert hashes(out) == before
-
-
 # ---- What a run prints ------------------------------------------------------------------------------------------
 def test_match__prints_plain_lines_and_a_table(done):
     out, result = done
@@ -629,22 +488,6 @@ def read_terminal(terminal):
         return b""
 
 
-def test_match__takes_names_as_they_are(folder, tmp_path):
-    """What square brackets, colons, blanks and accents mean to a shell, to rich or to GDAL is nobody's business."""
-    place = tmp_path / "[bold]é ü[/nothing]"
-    place.mkdir(parents=True)
-    for name in ("left", "right"):
-        (place / f":smile: {name} [1].tif").symlink_to(folder / f"{name}.tif")
-    out = place / "out [red] :tada:"
-    pair = {f"{name}": place / f":smile: {name} [1].tif" for name in ("left", "right")}
-    result = invoke(*matching(folder, out, **pair))
-    assert result.exit_code == 0, result.output
-    assert result.stdout.splitlines()[-2:] == [str(out / "run.json"), f"next: sat-intervals report '{out}'"]
-    assert sorted(path.name for path in out.iterdir()) == [LOCK, *OUTPUTS]
-    missing = place / "[/none].tif"
-    assert_refused(invoke(*matching(folder, out, "--overwrite", left=missing)), f"{missing} cannot be read")
-
-
 # ---- What files others find -------------------------------------------------------------------------------------
 def test_match__writes_what_rasterio_reads(folder, done):
     out, _ = done
@@ -679,32 +522,6 @@ def test_match__writes_what_rio_cogeo_takes_for_valid(done, name):
     assert cog_validate(done[0] / name, strict=True) == (True, [], [])
 
 
-def test_match__writes_what_match_arrays_gives_as_xarray(folder, tmp_path, scene):
-    assert invoke(*matching(folder, tmp_path / "out", "--quiet")).exit_code == 0
-    found = match_arrays(
-        *(np.ma.masked_equal(image, 0) for image in (scene.left, scene.right)), {"disparity": search(scene)}
-    )
-    with rasterio.open(tmp_path / "out" / "intervals.tif") as file:
-        bands = xr.DataArray(file.read(), dims=("band", "row", "column"), coords={"band": list(file.descriptions)})
-    assert list(bands["band"]) == [band.name for band in BANDS]
-    for name in bands["band"].values:
-        np.testing.assert_array_equal(bands.sel(band=name), found[name])
-    with rasterio.open(tmp_path / "out" / "validity.tif") as file:
-        np.testing.assert_array_equal(file.read(1), found["validity"])
-
-
-def test_match__reports_what_it_was_given(folder, done, scene):
-    report = json.loads((done[0] / "run.json").read_text())
-    assert report["settings"]["disparity"].items() >= search(scene).items()
-    assert (report["tiles"]["rows"], report["tiles"]["columns"]) == (4, 5)
-    for side in ("left", "right"):
-        shown, path = report["inputs"][side], folder / f"{side}.tif"
-        assert (shown["path"], shown["bytes"], shown["crs"]) == (str(path), path.stat().st_size, "EPSG:32631")
-        assert (shown["height"], shown["width"], shown["dtype"]) == (200, 260, "uint16")
-        digest = subprocess.run(["sha256sum", path], capture_output=True, text=True, check=True).stdout.split()[0]
-        assert shown["sha256"] == digest
-
-
 @pytest.mark.parametrize("right", ["elsewhere.tif", "narrow.tif", "nowhere.tif"])
 def test_match__takes_right_images_of_another_origin_width_or_none(folder, tmp_path, right):
     assert invoke(*matching(folder, tmp_path / "out", right=right)).exit_code == 0
@@ -721,38 +538,6 @@ def test_match__takes_the_band_asked_for_of_each_image(folder, tmp_path, scene, 
     assert hashes(tmp_path / "out") == hashes(done[0])
 
 
-def test_match__leaves_out_what_is_masked(folder, tmp_path):
-    result = invoke(*matching(folder, tmp_path / "out", "--left-mask", folder / "mask.tif"))
-    assert result.exit_code == 0
-    with rasterio.open(tmp_path / "out" / "validity.tif") as file:
-        masked = file.read(1) & 1 << 6 != 0
-    assert masked[:100].all()
-    assert not masked[100:].any()
-
-
-def test_match__nodata_of_the_command_line_takes_the_place_of_the_files_own(folder, tmp_path, scene):
-    level = int(np.median(scene.left))
-    result = invoke(*matching(folder, tmp_path / "out", "--nodata", f"{level},-1"))
-    assert result.exit_code == 0
-    with rasterio.open(tmp_path / "out" / "validity.tif") as file:
-        invalid = file.read(1) & 1 != 0
-    assert invalid[scene.left == level].all()
-    empty = np.argwhere(
-        scene.left[3:-3, 3:-3] == 0
-    )  # the right image's empty corner, and the left one's, are pixels now
-    assert not invalid[tuple(empty[0] + 3)] or empty.size == 0
-
-
-def test_match__overwrites_when_asked(folder, tmp_path):
-    out = tmp_path / "out"
-    assert invoke(*matching(folder, out)).exit_code == 0
-    (out / "notes.txt").write_text("mine")
-    assert invoke(*matching(folder, out, "--overwrite")).exit_code == 0
-    assert sorted(path.name for path in out.iterdir()) == sorted([LOCK, *OUTPUTS, "notes.txt"])
-    assert (out / "notes.txt").read_text() == "mine"
-    assert json.loads((out / "run.json").read_text())["counts"]["valid"] > 0
-
-
 def test_match__command_line_wins_over_the_file(folder, tmp_path):
     (tmp_path / "mine.yaml").write_text(
         "disparity: {minimum: -5, maximum: 5}\ntiles: {size: 128}\ninterval: {alpha: 0.8}"
@@ -766,7 +551,6 @@ def test_match__command_line_wins_over_the_file(folder, tmp_path):
 
 
 # ---- The other commands -----------------------------------------------------------------------------------------
-MCCNN = pytest.mark.peer("onnxruntime", "mc_cnn")
 
 
 @pytest.mark.parametrize(
@@ -797,31 +581,8 @@ def test_config__prints_the_defaults_without_options():
     )
 
 
-@pytest.mark.process
-def test_match__takes_a_preset_and_what_is_given_beside_it(folder, tmp_path):
-    (tmp_path / "beside.yaml").write_text("disparity: {minimum: -9, maximum: 9}\nsgm: {p2: 99}\n")
-    beside = ("--window", 60, 80, 70, 90, "--preset", "paper", "--set", "tiles.overlap=40")
-    command(*matching(folder, tmp_path / "out", *beside, config=tmp_path / "beside.yaml"))
-    report = json.loads((tmp_path / "out" / "run.json").read_text())
-    settings = report["settings"]
-    assert settings["preset"] == "paper"
-    assert (settings["cost"]["window"], settings["sgm"]["p1"], settings["sgm"]["p2"]) == (5, 8, 99)
-    assert settings["tiles"]["overlap"] == 40
-    del settings["preset"]  # known by what it set
-    config = {name: settings[name] for name in ("disparity", "cost", "sgm", "interval", "refinement", "tiles")}
-    (tmp_path / "spelt.yaml").write_text(json.dumps(config))
-    command(*matching(folder, tmp_path / "spelt", "--window", 60, 80, 70, 90, config=tmp_path / "spelt.yaml"))
-    assert hashes(tmp_path / "spelt") == hashes(tmp_path / "out")
-
-
 def test_options__offer_the_presets_of_the_settings():
     assert options.PRESETS == PRESETS
-
-
-def test_match__refuses_two_presets(folder, tmp_path):
-    (tmp_path / "paper.yaml").write_text(preset_text("paper"))
-    arguments = matching(folder, tmp_path / "out", "--preset", "satellite", config=tmp_path / "paper.yaml")
-    assert_refused(invoke(*arguments), "paper.yaml: preset is 'paper', and 'satellite' is asked for: leave one out")
 
 
 def test_demo__makes_a_scene_matches_it_and_tells_how_often_the_interval_holds(tmp_path):
@@ -852,17 +613,6 @@ def test_demo__makes_a_scene_matches_it_and_tells_how_often_the_interval_holds(t
     assert_refused(other, f"{out / 'left.tif'} exists: choose another name or --overwrite")
     assert invoke(*arguments, "--overwrite", "--quiet").stdout == ""
     assert hashes(out) == before
-
-
-@pytest.mark.process
-def test_demo__goes_on_where_it_was_interrupted(tmp_path):
-    out = tmp_path / "out"
-    arguments = ["demo", out, "--size", 200, 260, "--tile-size", 64, "--workers", 1]
-    returned, _, errors = ended_by(signal.SIGINT, arguments, out)
-    assert (returned, errors.count("\n")) == (130, 1)
-    assert_nothing_final(out)
-    result = command(*arguments)
-    assert (result.returncode, result.stderr) == (0, "")
 
 
 COMMANDS = [(), *((name,) for name in sorted(main.commands))]

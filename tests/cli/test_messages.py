@@ -7,15 +7,14 @@ import subprocess
 import numpy as np
 import pytest
 import rasterio
-from finished import random_bands, write_run
-from helpers import COMMAND, invoke, refused
+from helpers import COMMAND
 
 from sat_intervals import SatIntervalsError, load_config, match_arrays, open_image
 from sat_intervals.cli import app
 from sat_intervals.config.pairs import read_batch
 from sat_intervals.evaluate.dsm import evaluate_surface
 from sat_intervals.products import SURFACE
-from sat_intervals.raster import Georeferencing, Projection, read_window, write_layer
+from sat_intervals.raster import Projection, read_window
 from sat_intervals.tiling import Window
 
 LOCAL = 'LOCAL_CS["site grid",UNIT["metre",1],AXIS["x",EAST],AXIS["y",NORTH]]'
@@ -31,12 +30,6 @@ def write(path, bands, crs="EPSG:32631", tags=None, **options):
         if len(bands) == len(SURFACE):
             file.descriptions = [band.name for band in SURFACE]
     return path
-
-
-def ended(*arguments, **options):
-    return subprocess.run(
-        [COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=60, check=False, **options
-    )
 
 
 @pytest.mark.parametrize("error", [MemoryError("no array"), OSError(12, "Cannot allocate memory")])
@@ -56,16 +49,6 @@ def test_main__ends_quietly_when_its_reader_goes(arguments):
     assert (result.returncode, result.stderr) == (1, b"")
 
 
-def test_main__tells_of_a_line_break_in_a_path_in_one_line(tmp_path):
-    pages = write(tmp_path / "pa\nges.tif", np.ones((9, 9), np.uint8))
-    write(pages, np.ones((9, 9), np.uint8), APPEND_SUBDATASET="YES")
-    result = invoke("plan", str(pages), "no\n\x1b[2Jne.tif", "--disparity", "0", "4")
-    assert result.exit_code == 2
-    warning, error = result.stderr.splitlines()
-    assert "pa\\nges.tif has 2 pages" in warning
-    assert "no\\n\\x1b[2Jne.tif cannot be read" in error
-
-
 # ---- Settings and lists ------------------------------------------------------------------------------------------
 def test_read_batch__names_what_cannot_be_read_and_names_that_are_too_long(tmp_path):
     with pytest.raises(SatIntervalsError, match=r"nope.csv cannot be read: No such file or directory: "):
@@ -83,24 +66,6 @@ def test_load_config__refuses_a_preset_that_would_change_nothing_of_a_config():
 
 
 # ---- Images ------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("how", ["cut", "source"])
-def test_plan__of_an_image_that_cannot_be_read_speaks_of_no_run(tmp_path, how):
-    image = write(tmp_path / "image.tif", np.random.default_rng(0).integers(1, 255, (64, 64), np.uint8))
-    bad = tmp_path / "bad.vrt"
-    if how == "cut":
-        write_layer(bad, np.random.default_rng(0).integers(1, 255, (64, 64), np.uint8), 0, Georeferencing())
-        os.truncate(bad, bad.stat().st_size - 2000)
-    else:
-        bad.write_text(
-            '<VRTDataset rasterXSize="64" rasterYSize="64"><VRTRasterBand dataType="Byte" band="1"><SimpleSource>'
-            "<SourceFilename>nowhere.tif</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>"
-        )
-    result = invoke("plan", str(bad), str(image), "--disparity", "-2", "2")
-    (line,) = result.stderr.splitlines()
-    reason = f"{bad} cannot be read at rows 0 to 63" if how == "cut" else "nowhere.tif cannot be read: it is missing"
-    assert f"a sample of the pair cannot be matched: {reason}" in line
-    assert "--overwrite" not in line
-    assert result.exit_code == 1
 
 
 def test_open_image__refuses_a_colour_table(tmp_path):
@@ -178,16 +143,3 @@ def test_evaluate_surface__refuses_a_reference_in_feet(tmp_path, crs, unit):
         dataset.units = (unit,) if unit else dataset.units
     with pytest.raises(SatIntervalsError, match=r"reference.tif has heights in (ft|US survey foot): convert them to m"):
         evaluate_surface(dsm(tmp_path / "dsm.tif", "above egm96.gtx"), reference)
-
-
-@pytest.mark.parametrize("place", ["file", "file/in"])
-def test_folders__that_are_files_are_named_with_a_way_out_that_helps(tmp_path, place):
-    out, folder = write_run(tmp_path, *random_bands(20, 30)[:2]), tmp_path / place
-    (tmp_path / "file").touch()
-    reason = "File exists" if place == "file" else "Not a directory"
-    refused(
-        ["export", out, "--to", "otb", folder], f"{folder} cannot be written: {reason}: choose another name or folder\n"
-    )
-    pair = [write(tmp_path / name, np.arange(6400, dtype="uint16").reshape(64, 100)) for name in ("l.tif", "r.tif")]
-    command = ["match", *pair, tmp_path / "new", "--disparity", "0", "4", "--set", f"cluster.store={folder}"]
-    refused(command, f"{folder}/", "cannot be used: Not a directory: make room, check its rights or choose another")

@@ -27,8 +27,6 @@ from sat_intervals.config import (
     load_config,
     preset_text,
 )
-from sat_intervals.errors import SatIntervalsError
-from sat_intervals.products import COSINE_STEPS
 
 RANGE = {"disparity": {"minimum": -60, "maximum": 0}}
 
@@ -93,25 +91,6 @@ def test_preset_text__comments_every_setting_with_its_meaning_and_range(name: st
         model = type(getattr(config, name))
         expected += [(Config, name)] if model is str else [(model, key) for key in model.model_fields]
     assert commented == expected
-
-
-def test_preset_text__mccnn_holds_the_defaults_of_its_cost() -> None:
-    assert load_config(yaml.safe_load(preset_text("mccnn")), RANGE) == settings(
-        preset="mccnn", cost={"method": "mccnn"}
-    )
-
-
-def test_preset_text__paper_has_its_window_penalties_and_alpha() -> None:
-    config = load_config(yaml.safe_load(preset_text("paper")), RANGE)
-    own = {"cost": {"window": 5}, "sgm": {"p1": 8, "p2": 32}, "interval": {"alpha": 0.9}}
-    assert config == settings(preset="paper", **own)
-
-
-def test_preset_text__satellite_mccnn_has_constant_penalties_with_their_span() -> None:
-    config = load_config(yaml.safe_load(preset_text("satellite-mccnn")), RANGE)
-    sgm = {"penalty": "constant", "p1": 0.8, "p2": 4.5, "span": 48}
-    assert config == settings(preset="satellite-mccnn", cost={"method": "mccnn"}, sgm=sgm)
-    assert config.cost_span == 48 * COSINE_STEPS
 
 
 # --- presets beside settings
@@ -361,11 +340,6 @@ def test_load_config__p2_is_held_to_what_16_bits_hold(window: int, largest: int)
     assert 8 * (window**2 - 1 + largest + 1) > 65534
 
 
-def test_config_error__is_of_the_family() -> None:
-    assert issubclass(ConfigError, SatIntervalsError)
-    assert issubclass(SatIntervalsError, ValueError)
-
-
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -467,14 +441,3 @@ def test_thresholds__are_none_where_their_step_is_off() -> None:
     assert config.cut_level is None
     assert config.ambiguity_levels is None
     assert config.ambiguity_weights is None
-
-
-def test_load_config__names_the_file_that_the_system_finds_above_the_target_of_a_link(tmp_path, monkeypatch):
-    """In one spelling from any working directory, so that a run can be resumed from another one."""
-    (tmp_path / "job" / "lists").mkdir(parents=True)
-    (tmp_path / "lists").symlink_to("job/lists")
-    places = {".": "lists/../a.tif", "job/lists": "../a.tif", "job": "a.tif"}
-    for folder, name in places.items():
-        monkeypatch.chdir(tmp_path / folder)
-        config = settings(disparity={"grid": name}, cost={"method": "mccnn", "weights": name})
-        assert config.disparity.grid == config.cost.weights == str(tmp_path / "job" / "a.tif")

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import re
-import shutil
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from helpers import invoke
 from numpy.testing import assert_allclose
 
 from sat_intervals.raster import Georeferencing, footprint, north_up, read_layers
-from sat_intervals.show.canvas import page
 
 
 @pytest.fixture(scope="module")
@@ -128,21 +126,3 @@ def test_stac__refuses_times_that_are_none(made, time, says):
     done = invoke("stac", made[0], "--datetime", time)
     assert done.exit_code == 2
     assert re.fullmatch(f"sat-intervals: {time} {says}: .*\n", done.stderr)
-
-
-def test_write_item__is_made_again_without_a_picture_of_an_earlier_run(made, tmp_path):
-    out = shutil.copytree(made[0], tmp_path / "out")
-
-    def assets():
-        done = invoke("stac", out)
-        assert done.exit_code == 0
-        keys = json.loads((out / "stac.json").read_text())["assets"].keys()
-        assert ("overview" in keys) == ("overview.png is of another run" not in done.stderr)
-        return keys
-
-    with page(out / "overview.png", (1, 1), 50, "", "an earlier time"):
-        pass
-    assert "overview" not in assets()
-    (out / "overview.png").unlink()
-    assert invoke("plot", out, "--dpi", "50").exit_code == 0
-    assert "overview" in assets()

@@ -74,13 +74,6 @@ def check_against_reference(scene, alpha, refine):
         np.testing.assert_array_equal(bound, reference.absolute(expected, scene.minimum))
 
 
-@pytest.mark.parametrize("refine", [True, False])
-@bounded
-@given(scene=reference.scenes(), alpha=st.sampled_from(ALPHAS))
-def test_match_costs__interval_equals_reference(refine, scene, alpha):
-    check_against_reference(scene, alpha, refine)
-
-
 @pytest.mark.parametrize("count", COUNTS)
 @few
 @given(data=st.data())

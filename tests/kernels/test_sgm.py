@@ -95,18 +95,6 @@ def test_cost_volume__equals_reference_at_every_count(count, regularized, data):
     np.testing.assert_array_equal(volume(scene), reference.volume_of(scene))
 
 
-@pytest.mark.parametrize("count", [1, 33])
-@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1), (9, 2), (7, 3), (12, 5), (5, 12)])
-@few
-@given(data=st.data())
-def test_cost_volume__equals_reference_on_narrow_and_tall_patches(shape, count, data):
-    # Diagonals that leave the patch and enter it again, in every proportion of rows to columns.
-    patches = reference.patch_pair(data.draw(st.integers(0, 2**32 - 1)), *shape, count, 5)
-    states = [data.draw(reference.states(patch.shape)) for patch in patches]
-    scene = reference.scene_of(patches, states=states, window=5, minimum=-3, count=count)
-    np.testing.assert_array_equal(volume(scene), reference.volume_of(scene))
-
-
 def test_cost_volume__penalties_at_their_limit():
     # 8 * (window^2 - 1 + P2) = 65528, the largest multiple of 8 in 16 bits. The sums of impossible candidates
     # are greater and may saturate: nobody reads them.

@@ -1,10 +1,8 @@
 """With exact seams any tiling gives the result of the whole image, byte for byte."""
 
 import itertools
-import shutil
 import tempfile
 from pathlib import Path
-from types import SimpleNamespace
 
 import hypothesis
 import numpy as np
@@ -13,7 +11,7 @@ from helpers import PLACE, hashes, write_pair
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sat_intervals import RunError, SatIntervalsError, Window, match_pair
+from sat_intervals import RunError, Window, match_pair
 from sat_intervals.demo import make_scene
 from sat_intervals.match import schedule
 from sat_intervals.raster import write_layer
@@ -62,19 +60,6 @@ def test_match_pair__of_exact_tiles_equals_the_whole(folder, tmp_path, name):
     assert (tiled["tiles"]["overlap"], tiled["overlap_left"]) == ("exact", None)
 
 
-def test_match_pair__of_exact_tiles_equals_one_tile_with_overlap(folder, whole, tmp_path):
-    match(folder, tmp_path / "tiled", 64, {})
-    match(folder, tmp_path / "alone", 1024, {"tiles": {"size": 1024, "overlap": 20}})
-    assert hashes(tmp_path / "tiled") == hashes(tmp_path / "alone") == hashes(whole)
-
-
-def test_match_pair__of_exact_tiles_of_a_window_equals_one_tile(folder, tmp_path):
-    window = Window(20, 30, 101, 110)
-    for size in (64, 1024):
-        match(folder, tmp_path / str(size), size, {}, window=window)
-    assert hashes(tmp_path / "64") == hashes(tmp_path / "1024")
-
-
 @pytest.mark.parametrize("method", ["fast", "accurate"])
 def test_match_pair__of_blocks_of_exact_tiles_equals_the_whole(folder, tmp_path, monkeypatch, method):
     monkeypatch.setattr(schedule, "_BLOCKS", 1)  # of 2 x 2 tiles, at the ends of 1 x 2, 2 x 1 and 1 x 1
@@ -109,30 +94,6 @@ def test_match_pair__names_the_wavefront_that_cannot_be_traced(folder, tmp_path,
     monkeypatch.setattr(run, "trace_block", fail)
     with pytest.raises(RunError, match="tile 0_0: tracing its path states, wavefront 0: no reason"):
         match(folder, tmp_path / "out", 64, {})
-
-
-def test_match_pair__needs_space_for_path_states_before_it_starts(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr("shutil.disk_usage", lambda place: SimpleNamespace(free=10**6))
-    with pytest.raises(SatIntervalsError, match=r"has 1\.0 MB free, tiles, files and their parts may need 1\.\d MB"):
-        match(folder, tmp_path / "out", 64, {})
-
-
-def test_match_pair__takes_no_path_states_of_another_run(folder, whole, tmp_path, monkeypatch):
-    def end(job, tile):
-        raise RunError("before the first tile")
-
-    borders = tmp_path / "out" / "tiles" / "borders"
-    with monkeypatch.context() as patch:
-        patch.setattr(run, "match_block", end)
-        for settings in ({"sgm": {"p2": 30}}, {}):
-            if borders.exists():
-                shutil.move(tmp_path / "out", tmp_path / "other")
-            with pytest.raises(RunError, match="before the first tile"):
-                match(folder, tmp_path / "out", 64, settings)
-    for file in (tmp_path / "other" / "tiles" / "borders").iterdir():
-        shutil.copy(file, borders)
-    match(folder, tmp_path / "out", 64, {})
-    assert hashes(tmp_path / "out") == hashes(whole)
 
 
 @pytest.mark.peer("onnxruntime", "mc_cnn")

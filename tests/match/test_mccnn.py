@@ -11,11 +11,10 @@ import onnx
 import pytest
 import rasterio
 import reference
-from helpers import bands, hashes, invoke
+from helpers import bands, invoke
 from networks import random_weights, slow_features, trained_network, write_network
 
 from sat_intervals import RunError, SatIntervalsError, load_config, match_arrays, match_pair
-from sat_intervals.config.pairs import PairOfBatch
 from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import ChangedInputError
 from sat_intervals.kernels.matching import cost_volume
@@ -26,7 +25,6 @@ from sat_intervals.match.patch import kernel_settings
 from sat_intervals.match.whole import cut, whole_view
 from sat_intervals.products import COSINE_STEPS, IMPOSSIBLE_COST, INVALID
 from sat_intervals.results import open_results
-from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
 from sat_intervals.run.tile import match_block
 from sat_intervals.show.cost_curve import read_curve
@@ -36,9 +34,6 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning"),
     pytest.mark.peer("onnxruntime", "mc_cnn"),
 ]
-
-
-SEARCH = {"disparity": {"minimum": -4, "maximum": 6}}
 
 
 @pytest.fixture(scope="module")
@@ -110,16 +105,6 @@ def test_network__is_a_valid_convolution(network_file, weights):
     pixels = np.random.default_rng(0).standard_normal((19, 24), np.float32)
     features = load_network(network_file)(pixels)
     np.testing.assert_allclose(features, slow_features(weights, pixels), atol=1e-5)
-
-
-def test_network__without_a_unit_vector_makes_zeros(tmp_path, weights):
-    unbiased = {name: value * (not name.endswith("bias")) for name, value in weights.items()}
-    network = load_network(write_network(tmp_path / "unbiased.onnx", unbiased))
-    pixels = np.random.default_rng(0).standard_normal((19, 40), np.float32)
-    pixels[:, 10:30] = 0
-    features = network(pixels)
-    assert not features[:, :, 10:20].any()
-    np.testing.assert_allclose(np.linalg.norm(features[:, :, [0, 9, 20, 29]], axis=0), 1, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -264,47 +249,6 @@ def test_match_pair__equals_match_arrays_and_keeps_what_decides(tmp_path, networ
     assert load_config(run["settings"]) == config
 
 
-def test_match_pair__processes_and_threads_make_the_same_bytes_and_pages(tmp_path):
-    left, right = masked_images(70, 140)
-    images = write(tmp_path / "left.tif", left), write(tmp_path / "right.tif", right)
-    for kind in ("threads", "processes"):
-        config = settings(-4, 6, tiles={"size": 64, "overlap": 20}, cluster={"kind": kind, "workers": 2})
-        match_pair(*images, tmp_path / kind, config)
-    assert hashes(tmp_path / "threads") == hashes(tmp_path / "processes")
-    shown = invoke("report", tmp_path / "processes")
-    assert shown.exit_code == 0, shown.output
-    assert "mccnn" in (tmp_path / "processes" / "report.html").read_text()
-
-
-def test_match_pair__goes_on_with_the_means_that_were_measured(tmp_path, network_file):
-    left, right = masked_images(70, 140)
-    images = write(tmp_path / "left.tif", left), write(tmp_path / "right.tif", right)
-    config = settings(-4, 6, network_file, tiles={"size": 64, "overlap": 20})
-    expected = match_pair(*images, tmp_path / "once", config, keep_tiles=True)
-    match_pair(*images, tmp_path / "twice", config, keep_tiles=True)
-    tiles = tmp_path / "twice" / "tiles"
-    for name in ("intervals.tif", "validity.tif", "run.json"):
-        (tmp_path / "twice" / name).unlink()
-    next((tiles / "tiles").glob("*.npz")).unlink()
-    again = match_pair(*images, tmp_path / "twice", config)
-    assert again["normalization"] == expected["normalization"]
-    for one, other in zip(bands(tmp_path / "once"), bands(tmp_path / "twice"), strict=True):
-        np.testing.assert_array_equal(one, other)
-    other = write_network(tmp_path / "other.onnx", random_weights(seed=1))
-    for name in ("intervals.tif", "validity.tif", "run.json"):
-        (tmp_path / "once" / name).unlink()
-    with pytest.raises(SatIntervalsError, match=r"inputs\.weights\.sha256 was"):
-        match_pair(*images, tmp_path / "once", settings(-4, 6, other, tiles=config.tiles.model_dump()))
-
-
-def test_match_pair__an_image_that_cannot_be_measured_fails_the_run(tmp_path, network_file):
-    left, right = masked_images(70, 140)
-    images = write(tmp_path / "left.tif", left), write(tmp_path / "right.tif", right)
-    images[1].write_bytes(images[1].read_bytes()[:-4000])
-    with pytest.raises(RunError, match=r"right\.tif could not be measured: .*the file may be truncated"):
-        match_pair(*images, tmp_path / "out", settings(-4, 6, network_file))
-
-
 def test_match__preset_mccnn_brings_its_penalties_and_curves_are_drawn(tmp_path):
     left, right = masked_images(60, 80)
     images = write(tmp_path / "left.tif", left), write(tmp_path / "right.tif", right)
@@ -328,23 +272,6 @@ def test_match__preset_mccnn_brings_its_penalties_and_curves_are_drawn(tmp_path)
     results.report["inputs"]["weights"]["sha256"] = "0"
     with pytest.raises(ChangedInputError, match=r"has other weights than the run"):
         read_curve(results, row, column)
-
-
-def test_match_batch__measures_each_pair_and_goes_on_after_one_that_it_cannot(tmp_path, network_file):
-    left, right = masked_images(60, 140)
-    write(tmp_path / "left.tif", left), write(tmp_path / "right.tif", right)
-    (tmp_path / "cut.tif").write_bytes((tmp_path / "right.tif").read_bytes()[:-4000])
-    pairs = [
-        PairOfBatch(name, str(tmp_path / "left.tif"), str(tmp_path / f"{other}.tif"), settings=SEARCH)
-        for name, other in (("broken", "cut"), ("whole", "right"))
-    ]
-    cost = {"preset": "mccnn", "cost": {"weights": str(network_file)}}
-    report = match_batch(pairs, tmp_path / "out", cost)
-    assert {name: end["state"] for name, end in report.items()} == {"broken": "failed", "whole": "done"}
-    assert "cut.tif could not be measured" in report["broken"]["error"]
-    match_pair(tmp_path / "left.tif", tmp_path / "right.tif", tmp_path / "alone", SEARCH | cost)
-    for one, other in zip(bands(tmp_path / "out" / "whole"), bands(tmp_path / "alone"), strict=True):
-        np.testing.assert_array_equal(one, other)
 
 
 def test_match_tile__other_weights_on_a_worker_are_noticed(tmp_path):

@@ -75,18 +75,6 @@ def test_files_of__virtual_rasters_of_virtual_rasters_have_all_sources_and_their
     assert files_of(str(folder / "outer.vrt")) == [str(folder / name) for name in names]
 
 
-def test_files_of__a_virtual_raster_in_an_archive_are_beside_it(folder):
-    (folder / "image.vrt").write_text(virtual(1, "image.tif"))
-    name = zipped(folder, "all", "image.vrt", "image.tif")
-    assert files_of(name) == [name, f"/vsizip/{folder}/all.zip/image.tif"]
-
-
-def test_files_of__names_with_a_query_and_texts_have_their_source(folder, monkeypatch):
-    monkeypatch.chdir(folder)
-    for name in ("vrt://image.tif?bands=1", virtual(1, "image.tif")):
-        assert files_of(name) == [name, "image.tif"]
-
-
 def test_files_of__have_no_overviews_and_statistics(folder):
     for name in ("image.tif.msk", "image.tif.msk.ovr", "image.tif.ovr"):
         shutil.copy(folder / "mask.tif", folder / name)

@@ -8,7 +8,6 @@ import pytest
 from helpers import contents
 
 from sat_intervals.raster import OutputError, check_free, check_space, new_file, write_file
-from sat_intervals.raster.publishing import unfinished
 
 
 def test_new_file__is_not_there_before_it_is_whole(tmp_path):
@@ -73,29 +72,12 @@ def test_new_file__names_the_file_that_cannot_be_written(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["folder"]
 
 
-def test_new_file__leaves_errors_of_other_files_as_they_are(tmp_path):
-    def read():
-        with new_file(tmp_path / "a.txt"):
-            (tmp_path / "missing").read_text()
-
-    with pytest.raises(FileNotFoundError):
-        read()
-
-
 def test_write_file__leaves_nothing_on_a_full_disk(disk):
     place = disk(64 << 10)
     (place / "a.txt").write_text("before")
     with pytest.raises(OutputError, match=r"a\.txt cannot be written: No space left on device: free disk space or"):
         write_file(place / "a.txt", bytes(128 << 10))
     assert contents(place) == {str(place / "a.txt"): b"before"}
-
-
-def test_unfinished__is_deleted_unless_it_is_committed(tmp_path):
-    with unfinished(tmp_path / "a") as a, unfinished(tmp_path / "b") as b:
-        a.temporary.write_text("a")
-        b.temporary.write_text("b")
-        a.commit()
-    assert contents(tmp_path) == {str(tmp_path / "a"): b"a"}
 
 
 def test_check_free__refuses_what_may_not_be_replaced(tmp_path):

@@ -1,14 +1,11 @@
 """Reading and writing of rasters, on real files: refusals, pixels, metadata, temporary files."""
 
 import itertools
-import json
 import os
 import pickle
 import subprocess
-import sys
 import time
 import warnings
-import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -34,15 +31,12 @@ from sat_intervals.raster import (
     OutputError,
     OutputWriter,
     check_pair,
-    files_of,
     gdal,
     open_image,
     points_file,
     read_window,
-    surface_file,
 )
 from sat_intervals.raster.georeferencing import horizontal_name
-from sat_intervals.raster.identity import local_file
 from sat_intervals.raster.projection import utm_of
 from sat_intervals.raster.windows import kept_view, restored_view
 from sat_intervals.tiling import View, Window
@@ -139,17 +133,6 @@ def test_open_image__finds_a_relative_path_from_anywhere(tmp_path, monkeypatch):
     make(tmp_path / "left.tif", RAMP)
     monkeypatch.chdir(tmp_path)
     assert open_image("left.tif").path == str(tmp_path / "left.tif")
-
-
-@pytest.mark.parametrize("name", ["file://{}", "zip://{}!left.tif", "zip+file://{}!left.tif"])
-def test_files_of__a_name_of_rasterio_has_the_local_file(tmp_path, name):
-    file = make(tmp_path / "left.tif", RAMP)
-    if name.startswith("zip"):
-        with zipfile.ZipFile(tmp_path / "all.zip", "w") as archive:
-            archive.write(file, "left.tif")
-        file = tmp_path / "all.zip"
-    image = open_image(name.format(file))
-    assert str(local_file(files_of(image.path)[1])) == str(file)
 
 
 def test_open_image__reads_through_the_virtual_file_systems_of_gdal(tmp_path):
@@ -433,22 +416,6 @@ def test_read_window__of_a_mosaic_fails_in_every_thread(tmp_path, monkeypatch):
         assert all(threads.map(fails, range(200)))
 
 
-STATE = """import sys
-from sat_intervals.raster import open_image, read_window
-from sat_intervals.tiling import Window
-pixels, state = read_window(open_image(sys.argv[1]), Window(0, 0, 20, 30))
-print(state.any(axis=1).tolist())"""
-
-
-@pytest.mark.process
-def test_read_window__sees_a_mask_beside_an_image_whatever_the_users_options(tmp_path):
-    mask = np.arange(20)[:, None].repeat(30, 1) >= 5
-    path = make(tmp_path / "left.tif", np.full((20, 30), 7, np.uint8), external=mask)
-    setting = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR"}
-    done = subprocess.run([sys.executable, "-c", STATE, path], env=os.environ | setting, capture_output=True, text=True)
-    assert json.loads(done.stdout.lower()) == [True] * 5 + [False] * 15
-
-
 def test_read_window__is_quiet_and_right_in_many_threads(tmp_path):
     noise = np.random.default_rng(0).integers(0, 65535, (256, 256), np.uint16)
     image = open_image(make(tmp_path / "left.tif", noise))
@@ -479,12 +446,6 @@ def test_shifted__moves_transform_points_and_rpcs(tmp_path):
     rpcs = open_image(make(tmp_path / "c.tif", RAMP, **KINDS["rpcs"])).georeferencing.shifted(window).rpcs
     assert (rpcs.line_off, rpcs.samp_off) == (1970.25, 1214.5)
     assert (rpcs.lat_off, rpcs.line_scale, rpcs.line_num_coeff[1]) == (43.123456789, 2000, 0.333333333333333)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_shifted__by_nothing_changes_nothing(tmp_path, kind):
-    where = open_image(make(tmp_path / "left.tif", RAMP, **KINDS[kind])).georeferencing
-    assert where.shifted(Window(0, 0, 1, 1)) == where
 
 
 # Outputs
@@ -596,21 +557,6 @@ def test_output_writer__keeps_what_was_there_until_publish(tmp_path, products):
     assert left_behind(tmp_path) == ["intervals.tif"]
     produce(tmp_path, products)
     np.testing.assert_array_equal(look(tmp_path / "intervals.tif"), products[0])
-
-
-def test_output_writer__of_others_in_a_folder_disturbs_none_and_of_the_same_is_refused(tmp_path):
-    def writer(name: str) -> OutputWriter:
-        return OutputWriter(tmp_path, [surface_file(name)], 20, 30, Georeferencing(), {})
-
-    bands = np.zeros((6, 20, 30), np.float32)
-    with writer("a.tif") as one, writer("b.tif") as other:
-        with pytest.raises(OutputError, match=r"a\.tif is being written by another command"), writer("a.tif"):
-            pass
-        one.write(0, bands)
-        one.publish()
-        other.write(0, bands)
-        other.publish()
-    assert left_behind(tmp_path) == ["a.tif", "b.tif"]
 
 
 def test_output_writer__names_a_folder_that_cannot_be_made(tmp_path, products):

@@ -1,12 +1,9 @@
 """Batches, plans and states of runs, through the library and the command."""
 
-import errno
 import json
-import os
 import re
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,22 +11,19 @@ import rasterio
 import yaml
 from helpers import LOCK, PLACE, hashes, invoke
 
-from sat_intervals.config import Cluster, ConfigError, load_config
+from sat_intervals.config import ConfigError, load_config
 from sat_intervals.config.pairs import PairOfBatch, read_batch
 from sat_intervals.demo import make_scene
-from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.sgm import LAST
 from sat_intervals.match.memory import fitted, tile_bytes
 from sat_intervals.raster import write_layer
 from sat_intervals.results import open_run
-from sat_intervals.run import batch
 from sat_intervals.run.batch import Steps, match_batch
 from sat_intervals.run.checks import fitted_to_jobs
-from sat_intervals.run.connection import Connection
 from sat_intervals.run.job import prepare
 from sat_intervals.run.pair import match_jobs, match_pair
 from sat_intervals.run.plan import plan
-from sat_intervals.run.tile import match_block
 from sat_intervals.run.workers import Outcome, parse_memory
 from sat_intervals.store.lock import locked
 
@@ -76,21 +70,6 @@ def test_match_batch__keeps_the_counts_of_a_pair_whose_last_step_fails(images, t
     end = match_batch([pair], tmp_path / "batch", steps=Steps(finish=finish))[pair.name]
     assert (end["state"], end["error"]) == ("failed", "no model")
     assert end["counts"] == json.loads((tmp_path / "batch" / pair.name / "run.json").read_text())["counts"]
-
-
-def test_match_batch__that_cannot_write_its_report_can_be_run_again(images, tmp_path, monkeypatch):
-    write_bytes, full = Path.write_bytes, [OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))]
-
-    def fails_once(path, content):
-        if path.name == ".batch.json.part" and full:
-            raise full.pop()
-        return write_bytes(path, content)
-
-    monkeypatch.setattr(Path, "write_bytes", fails_once)
-    pairs = read_batch(rows(images))[:1]
-    with pytest.raises(RunError, match=r"batch.json cannot be written: No space left .*, and rerun the batch: it resu"):
-        match_batch(pairs, tmp_path)
-    assert match_batch(pairs, tmp_path)[pairs[0].name]["state"] == "done"
 
 
 @pytest.mark.parametrize("text", ["mine", '{"notes": {"state": "mine"}}'])
@@ -142,19 +121,6 @@ def test_batch__goes_on_after_a_failing_pair_and_then_does_only_what_is_missing(
     assert shown.stdout == "".join(f"{tmp_path / 'out' / name}: complete\n" for name in report)
 
 
-def test_match_batch__reads_the_settings_of_all_pairs_once(images, tmp_path, monkeypatch):
-    file, prepared = tmp_path / "settings.yaml", batch.prepare
-    file.write_text("sgm: {p1: 5}")
-
-    def and_changed(*arguments, **named):
-        file.write_text("sgm: {p1: 6}")
-        return prepared(*arguments, **named)
-
-    monkeypatch.setattr(batch, "prepare", and_changed)
-    match_batch(read_batch(rows(images)), tmp_path / "out", file)
-    assert {open_run(tmp_path / "out" / name).config.sgm.p1 for name in ("pair1", "pair2")} == {5}
-
-
 def write_ranges(file, like, minimum):
     """Write the same range for all pixels of an image."""
     with rasterio.open(like) as left:
@@ -179,15 +145,6 @@ def test_match_batch__does_not_take_a_result_for_that_of_other_ranges(images, tm
         dataset.write(np.full((1, 64, 64), -2, np.int16), [1], window=((0, 64), (0, 64)))  # the hull is the same
     report = match_batch(pairs, tmp_path / "out", {"disparity": {"grid": str(file)}})
     assert "already holds a run of other local ranges or of another version" in report["pair1"]["error"]
-
-
-def test_match_batch__knows_its_results_again_where_tiles_had_to_be_smaller(images, tmp_path):
-    memory = {"kind": "threads", "memory": "520MB"}  # of which a job may take 468
-    config = {"cluster": memory, "tiles": {"size": 1024}}
-    pairs = read_batch(rows(images))
-    match_batch(pairs, tmp_path, config)
-    assert json.loads((tmp_path / "pair1" / "run.json").read_text())["tiles"]["size"] < 1024
-    assert {end["state"] for end in match_batch(pairs, tmp_path, config).values()} == {"done before"}
 
 
 def test_match_batch__holds_the_folders_of_its_pairs(images, tmp_path):
@@ -215,25 +172,6 @@ def test_status__of_a_batch_goes_on_after_a_pair_without_a_run(images, tmp_path)
     shutil.rmtree(tmp_path / "pair1")
     result = invoke("status", tmp_path)
     assert result.stdout == f"{tmp_path / 'pair1'}: done\n{tmp_path / 'pair2'}: complete\n"
-
-
-def test_match_jobs__yields_a_job_whose_tiles_another_worker_finishes_meanwhile(images, tmp_path):
-    settings = {"disparity": {"minimum": -18, "maximum": 40}, "tiles": {"size": 64, "overlap": 20}}
-    jobs = [prepare(images / f"left{n}.tif", images / f"right{n}.tif", tmp_path / f"out{n}", settings) for n in (1, 2)]
-    for job in jobs:
-        job.begin()
-    ended = []
-
-    def progress(stage, done, total):
-        if done == 3:  # as one that outlived the run before
-            for tile in jobs[1].waiting()[-4:]:
-                match_block(jobs[1], tile)
-
-    with Connection(Cluster(workers=1), tmp_path) as client:
-        for job, failures, _ in match_jobs(client, jobs, progress):
-            assert not failures
-            ended.append(job)
-    assert ended == jobs
 
 
 class SlowTraces:

@@ -17,7 +17,7 @@ import pytest
 import yaml
 from helpers import COMMAND, LOCK, hashes, wait_until
 
-from sat_intervals import SatIntervalsError, match_pair
+from sat_intervals import SatIntervalsError
 from sat_intervals.config import Cluster
 from sat_intervals.errors import RunError
 from sat_intervals.run.batch_system import job_script
@@ -122,19 +122,6 @@ def test_match__goes_on_in_a_new_job_when_the_walltime_ends(slurm, pair, tmp_pat
     assert_complete(pair, tmp_path / "out")
 
 
-def test_match__goes_on_with_the_jobs_that_the_batch_system_took(slurm, pair, tmp_path):
-    once = tmp_path / "refused"
-    programs = sbatch(
-        tmp_path,
-        f"if mkdir {once} 2> /dev/null; then echo too many jobs >&2; exit 1; fi\n"
-        'exec $SBATCH --begin=now+5 "$@"',  # the refusal is there for longer than jobs are not
-    )
-    with submitted(pair, tmp_path, programs=programs, jobs=2):
-        pass
-    assert once.exists()
-    assert_complete(pair, tmp_path / "out")
-
-
 @pytest.mark.peer("dask_jobqueue")
 def test_match__prints_the_job_script_and_submits_nothing(pair, tmp_path):
     settings = yaml.safe_load((pair / "settings.yaml").read_text())
@@ -193,21 +180,6 @@ def test_match__waits_for_the_first_worker_and_says_so(slurm, pair, tmp_path):
     lines = (tmp_path / "log").read_text().splitlines()
     assert 1 <= len(lines) <= 20
     assert all("there is no worker yet" in line and str(tmp_path / "out" / "logs") in line for line in lines)
-    assert_complete(pair, tmp_path / "out")
-
-
-def test_match__ends_when_the_last_worker_has_gone_and_goes_on_after(slurm, pair, tmp_path):
-    once = tmp_path / "once"
-    programs = sbatch(tmp_path, f'mkdir {once} 2> /dev/null || set -- --begin=now+1hour "$@"\nexec $SBATCH "$@"')
-    with submitted(pair, tmp_path, 1, programs=programs, constants={"WORKERS_GONE": 5}) as process:
-        wait_for_tiles(process, tmp_path, 5)
-        (job,) = jobs()
-        subprocess.run(["scancel", job], check=True, timeout=30)
-    (line,) = (tmp_path / "log").read_text().splitlines()
-    assert "the last worker ended and none has started for 5 s" in line
-    assert str(tmp_path / "out" / "logs") in line
-    assert "rerun the same command: it resumes" in line
-    match_pair(pair / "left.tif", pair / "right.tif", tmp_path / "out", pair / "settings.yaml")
     assert_complete(pair, tmp_path / "out")
 
 

@@ -22,7 +22,6 @@ from sat_intervals.raster import write_layer
 from sat_intervals.run.calibrate import check_subjects
 from sat_intervals.run.job import prepare
 from sat_intervals.run.measure import Subject, measure_subjects, truth_of
-from sat_intervals.store.tiles import Store
 
 
 @pytest.fixture(scope="module")
@@ -186,19 +185,6 @@ def test_measure_subjects__ends_where_an_image_changes(scene, tmp_path):
     with pytest.raises(ChangedInputError, match=r"left\.tif was changed during the run \(left\.\w+ was"):
         measure_subjects(subjects, tmp_path, change)
     assert list(tmp_path.iterdir()) == [pair]
-
-
-def test_calibrate__takes_over_tiles_that_a_killed_one_left_in_a_store(scene, tmp_path, monkeypatch):
-    store = "--set", f"cluster.store={tmp_path / 'store'}"
-    with monkeypatch.context() as killed:
-        killed.setattr(Store, "remove", lambda store, kinds=(): None)
-        whole = calibrated(scene, tmp_path / "killed.yaml", *store)
-    damaged = next((tmp_path / "store").glob("*/tiles/*.npz"))
-    damaged.write_bytes(damaged.read_bytes()[:-9])
-    result = invoke("calibrate", scene, "--output", tmp_path / "again.yaml", "--name", "one", *store, "-q")
-    assert (result.exit_code, "are damaged or missing: rerun the same command" in result.stderr) == (1, True)
-    assert calibrated(scene, tmp_path / "again.yaml", *store) == whole
-    assert not list((tmp_path / "store").iterdir())
 
 
 def off(folder):

@@ -8,8 +8,6 @@ from store.test_tiles import DAMAGES
 from sat_intervals import match_pair
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError
-from sat_intervals.run import pair as run
-from sat_intervals.run.tile import match_block
 from sat_intervals.store.tiles import BORDERS, COSTS, ONCE, PARTS, PIXELS, TILES
 
 # A file of each kind, and the stage before which it is damaged.
@@ -111,16 +109,3 @@ def test_match_pair__resumes_where_all_files_of_a_kind_are_damaged(scene, tmp_pa
     for file in (tmp_path / "out" / "tiles" / kind).iterdir():
         damage(file, "one bit")
     matched(scene, tmp_path / "out")
-
-
-def test_match_pair__ends_where_a_disk_damages_all_files_written(scene, tmp_path, monkeypatch):
-    def and_damage(job, block):
-        match_block(job, block)
-        for tile in job.store.grid.within(block.core):
-            damage(job.out / "tiles" / TILES / f"{tile.name}.npz", "one bit")
-
-    folder, settings = scene
-    monkeypatch.setattr(run, "match_block", and_damage)
-    with pytest.raises(RunError, match=r"^tiles 0_0, .*, 1_2 in .* are damaged or missing: rerun the same command"):
-        match_pair(folder / "left.tif", folder / "right.tif", tmp_path / "out", settings)
-    assert not list((tmp_path / "out").glob("*.tif"))

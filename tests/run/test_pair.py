@@ -2,17 +2,16 @@
 
 import logging
 import shutil
-import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import rasterio
-from helpers import LOCK, OUTPUTS, bands, calibration, hashes, shares_that_differ, write_pair
+from helpers import LOCK, OUTPUTS, bands, hashes, shares_that_differ, write_pair
 from volumes import census_volume
 
 from sat_intervals import match_arrays, match_pair
-from sat_intervals.config import load_calibration, load_config
+from sat_intervals.config import load_config
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.products import INVALID
@@ -47,44 +46,6 @@ def test_match_pair__equals_match_arrays_in_one_tile(pair, tmp_path, more):
     intervals, validity = bands(tmp_path / "out")
     np.testing.assert_array_equal(intervals, [whole[name] for name in ("disparity", "lower", "upper", "confidence")])
     np.testing.assert_array_equal(validity, whole["validity"])
-
-
-def test_match_pair__compiles_the_tracing_of_path_states_for_several_tiles_only(pair, tmp_path, monkeypatch):
-    left, right, settings = pair
-
-    def traced(*arguments):
-        raise RunError("traced")
-
-    monkeypatch.setattr("sat_intervals.match.warm_up.trace_area", traced)
-    match_pair(left, right, tmp_path / "one", in_tiles(settings, 512, "exact"))
-    with pytest.raises(RunError, match="traced"):
-        match_pair(left, right, tmp_path / "many", in_tiles(settings, 64, "exact"))
-
-
-def test_match_pair__subpixel_bounds_in_tiles_equal_those_of_arrays(pair, tmp_path):
-    left, right, settings = pair
-    interval = {"coverage": 0.8, "calibration": calibration(load_config(settings), 30.5, 9.25, 0.8)}
-    settings = in_tiles(settings, 64, "exact", interval=interval)
-    report = match_pair(left, right, tmp_path / "out", settings)
-    with rasterio.open(left) as first, rasterio.open(right) as second:
-        whole = match_arrays(*(np.ma.masked_equal(file.read(1), 0) for file in (first, second)), settings)
-    intervals, validity = bands(tmp_path / "out")
-    np.testing.assert_array_equal(intervals, [whole[name] for name in ("disparity", "lower", "upper", "confidence")])
-    np.testing.assert_array_equal(validity, whole["validity"])
-    disparity, lower, upper, _ = (band[np.isfinite(intervals[0])] for band in intervals)
-    assert ((lower <= disparity) & (disparity <= upper)).all()
-    assert (64 * lower % 1 == 0).all()
-    assert (lower % 0.5 != 0).mean() > 0.5
-    with rasterio.open(tmp_path / "out" / "intervals.tif") as file:
-        tags = file.tags()
-    chosen = report["settings"]["interval"]["calibration"]
-    assert report["calibration"] == {
-        "name": "flat", "sha256": load_calibration(chosen).sha256, "coverage": 0.8,
-        "high": 30.5, "low": 9.25, "quantile": 0.8, "reached": True,
-    }  # fmt: skip
-    assert tags["CALIBRATION"] == f"flat {report['calibration']['sha256']}"
-    assert tags["COVERAGE"].startswith("0.8 (")
-    assert "ALPHA" not in tags
 
 
 def test_match_pair__warns_of_images_without_texture(pair, tmp_path, caplog):
@@ -136,23 +97,6 @@ def test_match_pair__tiles_with_overlap_equal_one_tile_nearly_everywhere(pair, t
     disparity, interval = shares_that_differ(tmp_path / "whole", tmp_path / "tiles")
     assert disparity <= 0.002
     assert interval <= 0.005
-
-
-def test_match_pair__tiles_without_sgm_equal_one_tile_everywhere(pair, tmp_path):
-    left, right, settings = pair
-    for name, size in (("whole", 512), ("tiles", 64)):
-        match_pair(left, right, tmp_path / name, in_tiles(settings, size, overlap=3, sgm=None))
-    np.testing.assert_array_equal(bands(tmp_path / "whole")[0], bands(tmp_path / "tiles")[0])
-    np.testing.assert_array_equal(bands(tmp_path / "whole")[1], bands(tmp_path / "tiles")[1])
-
-
-@pytest.mark.parametrize("kind", ["threads", pytest.param("processes", marks=pytest.mark.process)])
-def test_match_pair__gives_the_same_bytes_for_all_workers(pair, tmp_path, kind):
-    left, right, settings = pair
-    settings = in_tiles(settings, 64)
-    match_pair(left, right, tmp_path / "one", settings | {"cluster": {"workers": 1}})
-    match_pair(left, right, tmp_path / "more", settings | {"cluster": {"kind": kind, "workers": 2}})
-    assert hashes(tmp_path / "one") == hashes(tmp_path / "more")
 
 
 def test_match_pair__reports_what_a_small_overlap_left(pair, tmp_path):
@@ -231,18 +175,6 @@ def test_digest__tells_what_differences_tell(tmp_path):
     assert len(line) < 150
 
 
-@pytest.mark.parametrize("store", ["elsewhere", "memory://tiles"])
-def test_match_pair__gives_the_same_bytes_wherever_its_tiles_lie(pair, tmp_path, store):
-    left, right, settings = pair
-    settings = in_tiles(settings, 64)
-    match_pair(left, right, tmp_path / "here", settings)
-    store = store if "://" in store else f"file://{tmp_path}/{store}"
-    match_pair(left, right, tmp_path / "out", settings | {"cluster": {"store": store}})
-    assert hashes(tmp_path / "here") == hashes(tmp_path / "out")
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [LOCK, *OUTPUTS]
-    assert not list(tmp_path.glob("elsewhere/*"))
-
-
 def test_match_pair__says_which_image_is_empty(pair, tmp_path):
     left, _, settings = pair
     empty = tmp_path / "empty.tif"
@@ -252,23 +184,6 @@ def test_match_pair__says_which_image_is_empty(pair, tmp_path):
     with pytest.raises(SatIntervalsError, match=r"empty\.tif are no data"):
         match_pair(left, empty, tmp_path / "out", settings)
     assert not list((tmp_path / "out").glob("[a-z]*.*"))
-
-
-def test_match_pair__tiles_equal_one_tile_on_a_real_pair(shared_data, tmp_path):
-    left, right = (shared_data / "phr_picanteo_pre" / f"{side}.tif" for side in ("left", "right"))
-    # least squares would spread each difference over its windows
-    settings = {
-        "disparity": {"minimum": -13, "maximum": 33},
-        "refinement": {"method": "vfit"},
-        "interval": {"alpha": 0.9},
-    }
-    match_pair(left, right, tmp_path / "whole", in_tiles(settings, 1216, overlap=100))
-    match_pair(left, right, tmp_path / "tiles", in_tiles(settings, 256, overlap=100))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-        disparity, interval = shares_that_differ(tmp_path / "whole", tmp_path / "tiles")
-    assert disparity <= 0.002
-    assert interval <= 0.0025
 
 
 class _Matcher:

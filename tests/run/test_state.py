@@ -64,20 +64,6 @@ def test_match__with_an_equal_manifest_resumes(scene, tmp_path, options):
     assert tiles_of(out) == before
 
 
-def test_match__resumes_inside_blocks_of_tiles(tmp_path):
-    settings = write_pair(tmp_path, make_scene(320, 320, seed=1), tiles={"size": 64}, cluster={"workers": 1})
-    images = tmp_path / "left.tif", tmp_path / "right.tif"
-    match_pair(*images, tmp_path / "out", settings, keep_tiles=True)
-    expected = hashes(tmp_path / "out")
-    for name in OUTPUTS:
-        (tmp_path / "out" / name).unlink()
-    tiles = sorted((tmp_path / "out" / "tiles" / "tiles").iterdir())
-    for tile in tiles[5::7]:
-        tile.unlink()
-    match_pair(*images, tmp_path / "out", settings)
-    assert hashes(tmp_path / "out") == expected
-
-
 def test_match__with_an_equal_manifest_takes_over_equal_files_and_refuses_others(scene, tmp_path):
     out = unfinished(scene, tmp_path / "out")
     shutil.copy(scene / "kept" / "intervals.tif", out)  # as if it was killed between both names

@@ -120,45 +120,6 @@ def test_finish_strips__goes_on_from_the_parts_that_are_done(tall, tmp_path, mon
     assert hashes(out) == hashes(tall[0] / "kept")
 
 
-@pytest.mark.parametrize("store", ["", "elsewhere"])
-def test_assemble__copies_parts_with_workers_that_reach_the_folder(tall, tmp_path, monkeypatch, store):
-    threads, outcomes = [], assemble.Threads.outcomes
-
-    def counted(pool, tasks):
-        for outcome in outcomes(pool, tasks):
-            threads.append((pool._count, outcome.label))
-            yield outcome
-
-    monkeypatch.setattr(assemble.Threads, "outcomes", counted)
-    cluster = {"store": str(tmp_path / store)} if store else {}
-    done = []
-    matched(tall, tmp_path / "out", cluster=cluster | {"workers": 3}, progress=lambda *how: done.append(how))
-    copied = [count for count, label in threads if isinstance(label, tuple) and isinstance(label[-1], str)]
-    assert copied == 2 * PARTS * [2 if store else 3]
-    assert [how for how in done if how[0] == "files"] == [("files", n, 2 * PARTS) for n in range(2 * PARTS + 1)]
-    assert hashes(tmp_path / "out") == hashes(tall[0] / "kept")
-
-
-def test_assemble__makes_all_damaged_parts_again_at_once(tall, tmp_path, monkeypatch, caplog):
-    out, copy_parts = with_tiles(tall, tmp_path / "out"), assemble._copy_parts
-
-    def damaged(*arguments):
-        if not (tmp_path / "done").exists():
-            (tmp_path / "done").touch()
-            for name in ("0_1", "0_3", "1_0"):
-                (out / "tiles" / "parts" / f"{name}.npz").write_bytes(b"damaged")
-        copy_parts(*arguments)
-
-    monkeypatch.setattr(assemble, "_copy_parts", damaged)
-    matched(tall, out)
-    (warning,) = [record.getMessage() for record in caplog.records if "trying this now" in record.getMessage()]
-    assert warning == (
-        f"parts 0_1, 0_3, 1_0 in {out}/tiles are damaged or missing: rerun the same command: it makes them again; "
-        "trying this now"
-    )
-    assert hashes(out) == hashes(tall[0] / "kept")
-
-
 def test_match_pair__names_the_file_that_cannot_be_written(tall, tmp_path, monkeypatch):
     def full(*arguments):
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -284,36 +245,6 @@ def test_begin__refuses_a_disk_without_room_for_tiles_parts_and_files(tmp_path, 
     with pytest.raises(OutputError, match=r"has 80.0 MB free, tiles, files and their parts may need 150.0 MB"):
         job.begin()
     replace(job, has_files=False).begin()
-
-
-def test_begin__counts_missing_tiles_and_parts_only(tall, stopped, tmp_path, monkeypatch):
-    folder, settings = tall
-    needed = []
-    for name in ("kept", "stopped"):  # without and with all parts
-        out = shutil.copytree(folder / name / "tiles", tmp_path / name / "tiles").parent
-        job = prepare(folder / "left.tif", folder / "right.tif", out, settings)
-        for tile in (None, *job.store.grid):
-            if tile is not None:
-                job.store.delete("tiles", [tile.name])
-            with monkeypatch.context() as patch:
-                patch.setattr("shutil.disk_usage", lambda place: SimpleNamespace(free=0))
-                with pytest.raises(OutputError, match=r"tiles, files and their parts may need") as refused:
-                    job.begin()
-            needed.append(float(str(refused.value).partition("may need ")[2].partition(" MB")[0]))
-    kept, stopped_later = needed[:6], needed[6:]
-    assert kept == sorted(kept)
-    assert kept[-1] > kept[0] + 1
-    assert all(later < before for later, before in zip(stopped_later, kept, strict=True))
-
-
-def test_end_tiles__that_fails_does_not_fail_the_run(tall, tmp_path, monkeypatch, caplog):
-    def unreachable(out):
-        raise OSError(errno.EIO, "unreachable")
-
-    monkeypatch.setattr(assemble, "remove_tiles", unreachable)
-    matched(tall, tmp_path / "out")
-    assert "tiles of the complete run stay: [Errno 5] unreachable" in caplog.text
-    assert hashes(tmp_path / "out") == hashes(tall[0] / "kept")
 
 
 def test_status__counts_strips(tall, tmp_path, monkeypatch):

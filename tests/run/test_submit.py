@@ -1,16 +1,12 @@
 """Tasks on real clusters of dask: workers that die, stop or leave, a scheduler that is lost."""
 
 import os
-import signal
 import threading
 import time
-from contextlib import suppress
 
 import dask
-import psutil
 import pytest
 from distributed import Client, KilledWorker, LocalCluster
-from helpers import wait_until
 
 from sat_intervals.config import Cluster
 from sat_intervals.errors import RunError, SatIntervalsError
@@ -24,17 +20,6 @@ pytestmark = pytest.mark.process
 def in_threads(workers=1):
     """A cluster in threads of this process: its scheduler and workers are at hand."""
     return LocalCluster(n_workers=workers, threads_per_worker=1, processes=False, dashboard_address=None)
-
-
-def kill_workers():
-    """Kill the worker processes, also those that are just starting; return their ids."""
-    killed = set()
-    for child in psutil.Process().children():
-        with suppress(psutil.NoSuchProcess):
-            if "spawn_main" in " ".join(child.cmdline()):
-                child.kill()
-                killed.add(child.pid)
-    return killed
 
 
 def ended(client, *tasks):
@@ -68,22 +53,6 @@ def test_outcomes__a_task_that_kills_every_worker_fails(tmp_path, monkeypatch):
     assert reason(outcome.error).startswith("every worker that matched it died, the last at tcp://")
 
 
-def test_outcomes__go_on_when_workers_are_killed_as_they_start(tmp_path):
-    with connected(Cluster(kind="processes", workers=2), tmp_path) as client:
-        killed = set()
-        while len(killed) < 6:
-            killed |= kill_workers()
-        assert [end.result for end in ended(client, Task(0, abs, (-3,), 0))] == [3]
-
-
-def test_outcomes__go_on_without_a_worker_that_is_stopped(tmp_path, monkeypatch):
-    monkeypatch.setitem(submit.DASK, "distributed.scheduler.worker-ttl", "6s")
-    with connected(Cluster(kind="processes", workers=2), tmp_path) as client:
-        psutil.Process(min(client.run(os.getpid).values())).send_signal(signal.SIGSTOP)
-        outcomes = ended(client, *(Task(n, abs, (-n,), 2) for n in range(9)))
-    assert sorted((end.label, end.result) for end in outcomes) == [(n, n) for n in range(9)]
-
-
 def test_outcomes__end_when_the_scheduler_is_lost():
     with in_threads() as local, Client(local) as client:
         lost = threading.Timer(1, local.close)
@@ -91,14 +60,6 @@ def test_outcomes__end_when_the_scheduler_is_lost():
         with pytest.raises(RunError, match="the dask scheduler is gone; rerun the same command: it resumes"):
             ended(client, Task(0, time.sleep, (3,), 0))
         lost.join()
-
-
-def test_outcomes__tasks_that_nobody_waits_for_are_dropped():
-    with in_threads() as local, Client(local) as client:
-        outcomes = DaskWorkers(client).outcomes(Task(n, time.sleep, (1,), 0) for n in range(99))
-        next(outcomes)
-        outcomes.close()
-        wait_until(lambda: not local.scheduler.tasks, "no task is left")
 
 
 def test_connected__does_not_wait_for_a_host_that_nobody_knows(tmp_path):

@@ -1,6 +1,5 @@
 """A process killed in the middle of a run costs time and nothing else: real processes, really killed."""
 
-import json
 import os
 import random
 import re
@@ -179,49 +178,6 @@ def test_match__goes_on_after_kill_9_of_the_command(pair, tmp_path):
     assert_complete(pair, out)
 
 
-def test_batch__goes_on_after_kill_9_and_does_only_what_is_missing(pair, tmp_path):
-    names = ("one", "two", "three")
-    (pair / "pairs.json").write_text(json.dumps([{"name": n, "left": "left.tif", "right": "right.tif"} for n in names]))
-    command = [COMMAND, "batch", pair / "pairs.json", tmp_path, "--config", pair / "settings.yaml"]
-    command += ["--keep-tiles", "--quiet"]
-
-    def done() -> dict[Path, int]:
-        """Finished tiles and pairs, with their times."""
-        files = [*tmp_path.glob("*/tiles/tiles/[0-9]*.npz"), *tmp_path.glob("*/run.json")]
-        return {file: file.stat().st_mtime_ns for file in files}
-
-    chance = random.Random(3)
-    before: dict[Path, int] = {}
-    for count in (chance.randrange(5, TILES), chance.randrange(TILES, 3 * TILES)):
-        with subprocess.Popen(command) as batch:
-            wait_until(lambda: len(done()) >= count or batch.poll() is not None, f"{count} tiles")  # noqa: B023
-            assert batch.poll() is None
-            batch.kill()
-        assert set(json.loads((tmp_path / "batch.json").read_text())) == set(names)
-        before |= done()
-    assert subprocess.run(command, check=False).returncode == 0
-    after = done()
-    assert {file: after[file] for file in before} == before, "done twice"
-    assert len(after) == 3 * (TILES + 1)
-    for name in names:
-        shutil.rmtree(tmp_path / name / "tiles")
-        assert_complete(pair, tmp_path / name)
-
-
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_match__asked_to_end_leaves_no_worker_and_says_how_to_go_on(pair, tmp_path, number, status):
-    with started(pair, tmp_path / "out", "--cluster", "processes", "--workers", "2") as command:
-        command.wait_for_tiles(3)
-        workers = command.workers()
-        command.process.send_signal(number)
-        assert command.end(20) == status
-        assert "rerun the same command: it resumes" in command.output
-        assert len(command.output.splitlines()) == 1, command.output
-        _, alive = psutil.wait_procs(workers, 10)
-        assert not alive
-    assert len(done_tiles(tmp_path / "out")) >= 3
-
-
 @contextmanager
 def dask_process(*args: object) -> Iterator[psutil.Popen]:
     """``dask scheduler`` or ``dask worker``; killed with its children at the end."""
@@ -260,34 +216,6 @@ def scheduler(folder: Path) -> Iterator[tuple[str, psutil.Popen]]:
 def worker(address: str, folder: Path, *options: object):
     fixed = ("--host", "127.0.0.1", "--nthreads", 1, "--no-dashboard", "--local-directory", folder)
     return dask_process("worker", address, *fixed, *options)
-
-
-def test_match__goes_on_while_workers_join_and_leave(pair, tmp_path):
-    out = tmp_path / "out"
-    with scheduler(tmp_path) as (address, process):
-        with worker(address, tmp_path) as first, worker(address, tmp_path), Client(address) as client:
-            client.wait_for_workers(2, PATIENCE)
-            with started(pair, out, "--cluster", address) as command:
-                command.wait_for_tiles(5)
-                with worker(address, tmp_path):
-                    client.wait_for_workers(3, PATIENCE)
-                    kill_tree(first)
-                    assert command.end() == 0, command.output
-        assert process.is_running()
-        assert_complete(pair, out)
-
-
-def test_match__shares_a_scheduler_with_another_run(pair, tmp_path):
-    with (
-        scheduler(tmp_path) as (address, _),
-        worker(address, tmp_path),
-        started(pair, tmp_path / "a", "--cluster", address) as first,
-        started(pair, tmp_path / "b", "--cluster", address) as second,
-    ):
-        assert first.end() == 0, first.output
-        assert second.end() == 0, second.output
-    assert_complete(pair, tmp_path / "a")
-    assert_complete(pair, tmp_path / "b")
 
 
 def test_match__ends_when_the_scheduler_dies_and_goes_on_elsewhere(pair, tmp_path):
@@ -354,17 +282,6 @@ def test_match__names_the_tile_that_outgrows_its_workers(uneven, tmp_path):
         with worker(address, tmp_path), started(uneven, out, "--cluster", address) as command:
             assert command.end() == 0, command.output
     assert sorted(path.name for path in out.iterdir()) == [".sat-intervals.lock", *OUTPUTS]
-
-
-def test_match__is_not_stalled_by_a_tile_at_which_dask_pauses_its_worker(uneven, tmp_path, monkeypatch):
-    # above 80 % of the memory while the large tile is matched, below it before and after; dask would kill it at 95 %
-    monkeypatch.setenv("DASK_DISTRIBUTED__WORKER__MEMORY__TERMINATE", "False")
-    with (
-        scheduler(tmp_path) as (address, _),
-        worker(address, tmp_path, "--memory-limit", "450MiB"),
-        started(uneven, tmp_path / "out", "--cluster", address) as command,
-    ):
-        assert command.end() == 0, command.output
 
 
 def test_match__ends_where_the_disk_is_full_and_goes_on_after(pair, tmp_path, disk):

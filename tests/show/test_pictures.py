@@ -1,12 +1,8 @@
 """Pictures are written for any results: of the right size, not blank, with the right content."""
 
-import json
 import re
 import shutil
 import sys
-import tracemalloc
-from functools import reduce
-from operator import getitem
 
 import numpy as np
 import pytest
@@ -207,41 +203,6 @@ def test_draw_errors__colours_the_misses(tmp_path):
     assert 0.015 < above < 0.02  # of a picture that is mostly map
 
 
-def test_draw_errors__judges_every_pixel_of_a_thinned_map(tmp_path, monkeypatch, unrendered):
-    bands, validity, truth = random_bands(650, 350)
-    results = open_results(write_run(tmp_path, bands, validity, truth))
-    titles = []
-    monkeypatch.setattr("matplotlib.axes.Axes.set_title", lambda self, title: titles.append(title))
-    draw_errors(results, tmp_path / "errors.png", dpi=50)
-    valid = (classify(validity) < 2) & np.isfinite(truth)
-    missed = valid & ((truth < bands[1]) | (truth > bands[2]))
-    share = 100 * missed.sum() / valid.sum()
-    assert titles[-1] == f"The interval misses the truth at {share:.1f} % of {valid.sum():,} valid pixels"
-
-
-def test_draw_errors__holds_a_strip_at_a_time(tmp_path, unrendered):
-    height, width = 6_000, 200
-    (tmp_path / "small").mkdir()
-    small = open_results(write_run(tmp_path / "small", *random_bands(60, 50)))
-    draw_errors(small, tmp_path / "small" / "errors.png", dpi=50)  # what is imported and kept is not counted
-    results = open_results(write_run(tmp_path, *random_bands(height, width)))
-    tracemalloc.start()
-    draw_errors(results, tmp_path / "errors.png", dpi=50)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 8 * height * width  # less than the left image in floats, or where it is missed
-
-
-def test_maps__of_a_thin_image_show_every_pixel_of_its_short_side(tmp_path, monkeypatch, unrendered):
-    drawn, show = [], Axes.imshow
-    monkeypatch.setattr(Axes, "imshow", lambda self, x, **options: drawn.append(x) or show(self, x, **options))
-    results = open_results(write_run(tmp_path, *random_bands(12, 3000)))
-    draw_errors(results, tmp_path / "errors.png")
-    draw_overview(results, tmp_path / "overview.png")
-    assert len(drawn) == 2 + 5
-    assert all(array.shape[0] == 12 and 400 < array.shape[1] < 900 for array in drawn)
-
-
 def test_draw_profile__shows_a_pixel_that_stands_alone(tmp_path):
     bands, validity = no_bands(9, 60)
     bands[:, 4, 30], validity[4, 30] = (0, -4, 4, 1), 0
@@ -415,61 +376,6 @@ def test_draw_curve__without_sgm_interval_and_truth(tmp_path):
 def test_draw_curve__of_a_pixel_without_candidate_says_why(run, tmp_path):
     with pytest.raises(SatIntervalsError, match=r"row 0, column 0 has no cost curve: .*border.*: choose a pixel"):
         draw_curve(open_results(run), tmp_path / "curve.png", 0, 0)
-
-
-@pytest.mark.parametrize("content", [None, b"{}", b'{"\xff": 1}', b"[]", b"{"])
-def test_open_results__refuses_what_is_no_report(tmp_path, content):
-    if content:
-        (tmp_path / "run.json").write_bytes(content)
-    says = (
-        "is not the report of a run.*: match again" if content else "No such file .*: give the folder of a finished run"
-    )
-    with pytest.raises(SatIntervalsError, match=f"run.json:? {says}"):
-        open_results(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("place", "value"),
-    [(["inputs"], None), (["inputs"], {}), (["tiles", "region", "height"], "x"), (["settings"], 3)],
-)
-def test_plot__refuses_a_report_that_is_none(tmp_path, place, value):
-    out = write_run(tmp_path, *random_bands(4, 5))
-    report = json.loads((out / "run.json").read_text())
-    *sections, last = place
-    reduce(getitem, sections, report)[last] = value
-    (out / "run.json").write_text(json.dumps(report))
-    done = invoke("plot", out)
-    assert done.exit_code == 2
-    assert re.fullmatch(rf"sat-intervals: {out}/run.json(:| is not the report of a run).*\n", done.output)
-
-
-def test_open_results__refuses_files_that_are_not_those_of_the_report(tmp_path):
-    bands, validity, _ = random_bands(4, 5)
-    out = write_run(tmp_path, bands, validity)
-    report = json.loads((out / "run.json").read_text())
-    report["tiles"]["region"]["height"] = 99999
-    (out / "run.json").write_text(json.dumps(report))
-    with pytest.raises(SatIntervalsError, match=r"intervals.tif has 4 bands of .* run.json says 4 bands of 99999 x 5"):
-        open_results(out)
-    write_run(tmp_path, bands, validity)
-    write_layer(out / "intervals.tif", bands[0], np.nan, PLACE)
-    with pytest.raises(SatIntervalsError, match=r"intervals.tif has 1 bands of .* run.json says 4 bands of 4 x 5"):
-        open_results(out)
-    write_run(tmp_path, bands, validity)
-    (out / "validity.tif").unlink()
-    with pytest.raises(SatIntervalsError, match=r"validity.tif: no such file: give"):
-        open_results(out)
-
-
-def test_open_results__refuses_other_images_than_those_of_the_run(tmp_path):
-    bands, validity, truth = random_bands(40, 50)
-    out = write_run(tmp_path, bands, validity)
-    write_layer(tmp_path / "truth.tif", truth[1:], np.nan, PLACE)
-    with pytest.raises(SatIntervalsError, match="39 x 50 pixels, the left image 40 x 50, the run 40 x 50"):
-        open_results(out)
-    write_layer(tmp_path / "left.tif", np.ones((41, 50), np.uint16), 0, PLACE)
-    with pytest.raises(SatIntervalsError, match="41 x 50 pixels, but had 40 x 50 when it was matched"):
-        open_results(out)
 
 
 def test_classify__takes_the_first_reason():

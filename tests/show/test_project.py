@@ -15,13 +15,10 @@ from finished import PLACE, no_bands, random_bands, without_intervals, write_run
 from helpers import invoke
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
-from rasterio.crs import CRS
 from surfaces import write_raster
 
 from sat_intervals.products import INVALID
-from sat_intervals.raster import ControlPoint, Georeferencing
 from sat_intervals.show.legend import PIXEL_CLASSES, classify
-from sat_intervals.show.styles import difference
 
 SYSTEM_PYTHON = "/usr/bin/python3"
 
@@ -100,26 +97,6 @@ def test_widths__are_differences_at_the_same_place(run):
         assert (width.crs, width.transform) == (PLACE.crs, PLACE.transform)
     with rasterio.open(out / "dsm_half_width.vrt") as half:
         assert_array_equal(half.read(1), np.full((60, 80), 1.5))
-
-
-@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
-def test_difference__keeps_control_points(tmp_path, run):
-    points = tuple(
-        ControlPoint(row, column, 5 + column / 9, 44 - row / 9, 30.0) for row in (0, 60) for column in (0, 80)
-    )
-    place = Georeferencing(gcps=points, gcps_crs=CRS.from_epsg(4326))
-    (run[0] / "gcps.vrt").write_bytes(difference(("intervals.tif", 3, 2), place, (60, 80)))
-    with rasterio.open(run[0] / "gcps.vrt") as dataset:
-        assert Georeferencing.of(dataset) == place
-
-
-def test_write_project__replaces_its_files(run):
-    out, _, _ = run
-    for name in ("project.qgz", "width.vrt", "intervals.qml"):
-        (out / name).write_text("of before")
-    assert invoke("project", out).exit_code == 0
-    assert ElementTree.parse(out / "intervals.qml").find(".//colorrampshader") is not None
-    assert layers_of(read_project(out))
 
 
 def test_write_project__leaves_out_what_is_missing_or_of_another_run(run):

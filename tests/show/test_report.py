@@ -182,19 +182,6 @@ def test_page__tells_what_the_run_tells(page):
     assert not {"null", "walltime"} & set(page.text("#run").split())  # settings without a value
 
 
-def test_page__without_scripts_shows_a_table(browser, tmp_path):
-    path, _ = reported(tmp_path, *random_bands(60, 80))
-    browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
-    try:
-        browser.get(path.as_uri())
-        text = browser.find_element("tag name", "body").text
-    finally:
-        browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
-    assert "need JavaScript" in text
-    assert "median interval width" in text
-    assert "Loading" not in text
-
-
 def test_page__click_on_the_map_shows_that_row(page):
     from selenium.webdriver import ActionChains
 
@@ -211,16 +198,6 @@ def test_page__click_on_the_map_shows_that_row(page):
     assert (row, column) == pytest.approx((15, 60), abs=1)
     assert f"Row {row}, column {column}: " in page.text("#pixel")
     assert page.text("#command").endswith(f"--row {row} --pixel {row} {column}")
-
-
-def test_page__slider_works_from_the_keyboard(page):
-    before = page.band()
-    page.find("#row").send_keys(HOME)
-    assert page.text("#row-number") == "0"
-    first = page.band()
-    page.find("#row").send_keys(ARROW_RIGHT)
-    assert page.text("#row-number") == "1"
-    assert len({before, first, page.band()}) == 3
 
 
 def test_page__says_of_a_pixel_what_the_files_say(browser, tmp_path):
@@ -243,19 +220,6 @@ def test_page__layers_change_the_map_and_its_key(page):
     assert "truth above the interval" in seen["Misses"][1]
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (3, 400)])
-def test_page__of_no_valid_pixel_says_so(browser, tmp_path, shape):
-    path, _ = reported(tmp_path, *no_bands(*shape))
-    page = Page(browser, path)
-    assert "no valid pixel in this row" in page.text("#profile")
-    assert "rejected by cross-checking: occlusion" in page.text("#pixel")
-    assert "no pixel" in page.text("#widths")
-    page.find("#layers label:nth-of-type(2)").click()
-    assert page.text("#key").endswith("No pixel has a value.")
-    assert not page.find("#evaluation").is_displayed()
-    assert page.complaints() == []
-
-
 def test_page__of_a_run_without_intervals_claims_none(browser, tmp_path):
     page = Page(browser, write_report(open_results(without_intervals(tmp_path))))
     line, box = page.browser.execute_script("""
@@ -276,15 +240,6 @@ def test_page__of_a_run_without_intervals_claims_none(browser, tmp_path):
     words = page.text("#pixel").replace("\u2212", "-")
     assert f"disparity {disparity[20, column]:.1f}"[:-1] in words
     assert "interval " not in words.replace("interval regularised", "")
-    assert page.complaints() == []
-
-
-@pytest.mark.parametrize("shape", [(3000, 12), (12, 3000)])
-def test_page__of_a_thin_image_has_a_map_to_click_on(browser, tmp_path, shape):
-    path, _ = reported(tmp_path, *random_bands(*shape))
-    page = Page(browser, path)
-    size = page.find("#map canvas").size
-    assert 100 < min(size.values()) < max(size.values()) < 1300
     assert page.complaints() == []
 
 

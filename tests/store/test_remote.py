@@ -111,35 +111,6 @@ def test_match__in_a_bucket_goes_on_after_kill_9(bucket, pair, tmp_path):
     assert_complete(pair, out, "tiles")
 
 
-def test_match__names_where_its_tiles_are_and_starts_anew_elsewhere(bucket, pair, tmp_path):
-    first, second, out = f"{bucket}/first", tmp_path / "second", tmp_path / "out"
-    with started(pair, out, first) as run:
-        wait_for_tiles(run, first, 2)
-        run.terminate()
-        assert ended(run)[0] == 143
-    with started(pair, out, second) as run:
-        status, output = ended(run)
-    assert status == 2
-    assert re.search(rf"holds the tiles of another run: place was \"{first}/\w+\", now \"{second}", output)
-    with started(pair, out, second, "--overwrite") as run:
-        assert ended(run) == (0, "")
-    assert objects(first) == {}
-    assert not list(second.iterdir())
-    assert_complete(pair, out)
-
-
-def test_batch__keeps_the_tiles_of_equal_pairs_in_folders_of_their_own(bucket, pair, tmp_path):
-    rows = [{"name": name, "left": "left.tif", "right": "right.tif"} for name in ("one", "two")]
-    (pair / "pairs.json").write_text(json.dumps(rows))
-    command = [COMMAND, "batch", pair / "pairs.json", tmp_path, "--config", pair / "settings.yaml", "--quiet"]
-    command += ["--set", f"cluster.store={bucket}/batch/", "--keep-tiles", "--tile-size", "512"]
-    subprocess.run(command, check=True)
-    names = sorted(re.sub(r"-\w{32}/", "/", name) for name in records(f"{bucket}/batch"))
-    assert names == ["one/tiles/0_0.npz", "two/tiles/0_0.npz"]
-    for name in ("one", "two"):
-        assert sorted(path.name for path in (tmp_path / name).iterdir()) == sorted([LOCK, *OUTPUTS, "tiles"])
-
-
 def test_match__reads_images_in_a_bucket_and_knows_them_by_size_and_etag(bucket, pair, tmp_path, monkeypatch):
     # what GDAL calls the address of the service
     monkeypatch.setenv("AWS_S3_ENDPOINT", os.environ["AWS_ENDPOINT_URL"].removeprefix("http://"))
