@@ -76,8 +76,8 @@ def calibrate(
     the same settings.
 
     One of PAIRS is a folder with left.tif, right.tif, truth.tif and meta.json (`disparity`: [minimum, maximum],
-    `group`), a CSV file with the columns left, right, truth, minimum, maximum and optionally name, group, tolerance and
-    remove_bias, or the folder of a finished run, which is matched again from its images. The truth may be sparse:
+    `group`), a CSV, YAML or JSON file with left, right, truth, minimum, maximum and optionally name, group, tolerance
+    and remove_bias, or the folder of a finished run, which is matched again from its images. The truth may be sparse:
     unknown pixels are NaN or no data.
 
     The table shows what to expect: figures of each pair with the levels found on the others, means over pairs. A single

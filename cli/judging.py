@@ -79,7 +79,7 @@ def find_sources(paths: Sequence[Path], truths: Sequence[Path], masks: Sequence[
         else:
             raise SatIntervalsError(
                 f"{path} is neither a pair nor a finished run: give a folder with left.tif, right.tif, truth.tif and "
-                "meta.json, a CSV file, or the folder of a run"
+                "meta.json, a CSV, YAML or JSON file of pairs, or the folder of a run"
             )
     check_names(name for name, _ in found)
     for option, given in (("--truth", truths), ("--mask", masks)):
