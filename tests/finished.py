@@ -76,13 +76,6 @@ def _report(inputs, bands, validity):
         "validity_bits": {
             flag.name: {"bit": flag.bit, "meaning": flag.meaning, "invalid": flag.invalid} for flag in FLAGS
         },
-        "overlap_left": {
-            "borders": 7,
-            "pixels": 1000,
-            "winner_share": 0.01,
-            "bounds_share": 0.02,
-            "worst": {"between": ["0_1", "1_1"], "pixels": 100, "winner_share": 0.05, "bounds_share": 0.1},
-        },
         "seconds": {"tiles": 1.0, "tiles.read": 0.5, "total": 1.0},
         "versions": {"python": "3.11"},
     }

@@ -10,7 +10,6 @@ from typing import Any
 
 from sat_intervals.config import Config, calibration_of
 from sat_intervals.match.postprocess import ConfidenceScale
-from sat_intervals.match.seams import seam_report
 from sat_intervals.match.statistics import Tally
 from sat_intervals.products import FLAGS
 from sat_intervals.run.job import Job, origin_of
@@ -98,7 +97,6 @@ def report_of(
         "validity_bits": {
             flag.name: {"bit": flag.bit, "meaning": flag.meaning, "invalid": flag.invalid} for flag in FLAGS
         },
-        "overlap_left": None if tables.seams is None else seam_report(tables.seams, grid),
         "seconds": {stage: round(value, 3) for stage, value in seconds.items()},
         "versions": dict(_versions()),
         "quality": quality,

@@ -21,7 +21,6 @@ from sat_intervals.match.patch import (
     path_window,
 )
 from sat_intervals.match.schedule import Step, needs
-from sat_intervals.match.seams import seam_lines
 from sat_intervals.products import NO_DISPARITY
 from sat_intervals.progress import timed
 from sat_intervals.raster import Image, read_window
@@ -203,6 +202,4 @@ def _tile_products(patch: Patch, tile: Tile, job: Job) -> dict[str, np.ndarray]:
     histogram = ambiguity_histogram(ambiguity, arrays["winner"] != NO_DISPARITY, job.config.largest_ambiguity)
     if job.config.cross_check:
         arrays |= {"right_cost": patch.right.cost, "right_winner": patch.right.winner}
-    if job.config.tiles.overlap != "exact":
-        arrays["seams"] = seam_lines(raw, patch.output, tile.core, job.store.grid.size)
     return arrays | {"ambiguity": ambiguity, "histogram": histogram}

@@ -37,7 +37,6 @@ class Tables(NamedTuple):
     """What is summed over all tiles, or kept of each."""
 
     histogram: np.ndarray  # int64 (ambiguities + 1,): pixels by ambiguity
-    seams: np.ndarray | None  # int16 (grid rows, grid columns, side, own or ring, products, size); None if exact
     records: dict[str, dict[str, Any]]  # ``meta`` of the tiles, by name
 
 
@@ -107,31 +106,28 @@ class Store:
         """Write the products of a tile.
 
         ``arrays`` are the fields of `Raw` of the core's shape, ``right_cost`` and ``right_winner`` of the right view,
-        ``histogram``, and ``seams`` with overlaps.
+        and ``histogram``.
         """
         rows = {name: arrays[name] for name in arrays if not name.startswith("right_")}
-        tables = {name: rows.pop(name) for name in ("histogram", "seams") if name in rows}
+        histogram = rows.pop("histogram")
         if "right_cost" in arrays:
             rows["right"] = _rank(arrays["right_cost"], arrays["right_winner"])
         starts = range(0, tile.core.height, _ROWS)
         of_rows = ((f"{start:05}/{name}", rows[name][start : start + _ROWS]) for start in starts for name in rows)
-        self.write(TILES, tile.name, [*tables.items(), *of_rows], **meta)
+        self.write(TILES, tile.name, [("histogram", histogram), *of_rows], **meta)
 
     def tables(self) -> Tables:
         """Read what is summed over all tiles; raise DamagedTilesError if one is missing or damaged."""
         histogram: np.ndarray = np.zeros(1, np.int64)
-        seams, records = [], {}
+        records = {}
         try:
             for tile in self.grid:
                 with self.opened(TILES, tile.name) as archive:
                     records[tile.name] = archive.meta
                     histogram = histogram + archive["histogram"].astype(np.int64)
-                    if "seams" in archive.names():
-                        seams.append(archive["seams"])
         except DamagedFileError as error:
             raise self.damaged(self.grid) from error
-        shape = self.grid.rows, self.grid.columns
-        return Tables(histogram, np.reshape(seams, (*shape, *seams[0].shape)) if seams else None, records)
+        return Tables(histogram, records)
 
     def strips(self, rows: int, count: int, first: int = 0, last: int | None = None) -> Iterator[dict[str, np.ndarray]]:
         """Yield products of full-width strips of about ``rows`` rows, as fields of `RawRows`, of ``count`` disparities.

@@ -99,16 +99,6 @@ def test_match_pair__tiles_with_overlap_equal_one_tile_nearly_everywhere(pair, t
     assert interval <= 0.005
 
 
-def test_match_pair__reports_what_a_small_overlap_left(pair, tmp_path):
-    left, right, settings = pair
-    wide = match_pair(left, right, tmp_path / "wide", in_tiles(settings, 64, overlap=60))["overlap_left"]
-    narrow = match_pair(left, right, tmp_path / "narrow", in_tiles(settings, 64, overlap=3))["overlap_left"]
-    # 2 x 3 tiles: 2 * 2 borders between columns and 3 between rows
-    assert wide["borders"] == narrow["borders"] == 7
-    assert wide["bounds_share"] < narrow["bounds_share"] <= narrow["worst"]["bounds_share"]
-    assert narrow["winner_share"] > 0.01
-
-
 def test_match_pair__writes_a_complete_report(pair, tmp_path):
     left, right, settings = pair
     report = match_pair(left, right, tmp_path / "out", settings)

@@ -80,7 +80,6 @@ def test_tables__sum_over_all_tiles(written):
     store, made = written
     tables = store.tables()
     np.testing.assert_array_equal(tables.histogram, sum(each["histogram"].astype(int) for each in made.values()))
-    assert tables.seams is None
     assert tables.records["2_1"]["seconds"] == 1.5
 
 

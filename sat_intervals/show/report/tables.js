@@ -163,36 +163,25 @@ function showRows(place, { looks }) {
 
 function showTiles() {
   const { rows, columns, size, overlap } = run.tiles;
-  const seams = run.overlap_left;
   const place = find("tiles");
   if (rows * columns === 1) {
     place.append(element("p", {}, `One tile of at most ${size} x ${size} pixels: no seams.`));
     return;
   }
   const count = `${grouped(rows * columns)} tiles of ${size} x ${size} pixels`;
-  const differs = seams && (seams.winner_share > 0 || seams.bounds_share > 0);
   const figure = element("figure", { style: "max-width: 420px" });
   place.append(
-    element("p", {}, seams === null ? `${count}, which hand path states to their neighbours: no seams.` :
-      `${count}, read with an overlap of ${overlap} px. Adjacent tiles both match the pixels along their ` +
-      `${grouped(seams.borders)} common borders. Of these ${grouped(seams.pixels)} pixels, before filters, ` +
-      `${percent(seams.winner_share)} differ in disparity and ${percent(seams.bounds_share)} in a bound. A larger overlap reduces this.`),
+    element("p", {}, overlap === "exact" ? `${count}, which hand path states to their neighbours: no seams.` :
+      `${count}, read with an overlap of ${overlap} px.`),
     figure,
   );
-  drawing(figure, tilesHeight(420), "Grid of tiles", (width) => drawTiles(width, differs ? seams.worst.between : null));
-  if (!differs) return;
-  const worst = `the border with most differences: ${percent(seams.worst.winner_share)} of the disparities, ` +
-    `${percent(seams.worst.bounds_share)} of the bounds of ${grouped(seams.worst.pixels)} pixels`;
-  place.append(
-    element("p", { class: "legend" }, ...legend([[worst, "var(--truth)", true]])),
-    element("p", { class: "quiet" }, "A run keeps the totals and this border only."),
-  );
+  drawing(figure, tilesHeight(420), "Grid of tiles", drawTiles);
 }
 
 const tilesHeight = (width) => Math.min(420, Math.max(60, Math.round((width * run.tiles.region.height) / run.tiles.region.width)));
 
-/** Draw the borders of the tiles; `worst` names two tiles (row_column) whose common border is coloured. */
-function drawTiles(wide, worst) {
+/** Draw the borders of the tiles. */
+function drawTiles(wide) {
   const { rows, columns, size, region: { height, width } } = run.tiles;
   const tall = tilesHeight(420);
   const x = (column) => (wide * Math.min(column * size, width)) / width;
@@ -201,11 +190,6 @@ function drawTiles(wide, worst) {
   const parts = [svg("rect", { width: wide, height: tall, fill: "var(--soft)" })];
   for (let column = 0; column <= columns; column++) parts.push(line(x(column), 0, x(column), tall));
   for (let row = 0; row <= rows; row++) parts.push(line(0, y(row), wide, y(row)));
-  if (worst) {
-    const [[above, ], [row, column]] = worst.map((name) => name.split("_").map(Number));
-    const end = above === row ? [x(column), y(row + 1)] : [x(column + 1), y(row)];
-    parts.push(line(x(column), y(row), ...end, { style: "stroke: var(--truth); stroke-width: 4" }));
-  }
   return parts;
 }
 
