@@ -32,7 +32,7 @@ _HALVES = "scale_row", "scale_col", "scale_alt", "scale_x", "scale_y"
 
 
 def read_model(path: str | Path) -> Any:
-    """Read an RPC model: a raster that GDAL finds one for, ``.RPB``, ``_RPC.TXT``, ``.geom`` or DIMAP XML."""
+    """Read an RPC model: a raster that GDAL finds one for, a text of coefficients, ``.geom`` or DIMAP XML."""
 
     def read(name: str) -> Any:
         found = read_rpc_file(name)

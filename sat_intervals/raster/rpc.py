@@ -1,6 +1,7 @@
 """Find and read the RPC models of sensor images."""
 
-import shutil
+import os
+import re
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -13,6 +14,9 @@ from sat_intervals.raster.images import opened
 
 # What GDAL reads beside an image only, and what shareloc does not read at all.
 _BESIDE = ".rpb", "_rpc.txt"
+# Names in the order of files without names, after two errors in some.
+_SINGLE = [f"{axis}_{what}" for what in ("OFF", "SCALE") for axis in ("LINE", "SAMP", "LAT", "LONG", "HEIGHT")]
+_LISTS = [f"{axis}_{part}_COEFF_{i}" for axis in ("LINE", "SAMP") for part in ("NUM", "DEN") for i in range(1, 21)]
 
 
 def find_model(image: str) -> str | None:
@@ -28,13 +32,25 @@ def find_model(image: str) -> str | None:
 
 
 def read_rpc_file(path: str) -> dict[str, Any] | None:
-    """Return the coefficients in a file .RPB or _RPC.TXT by rasterio's names; None if it is of another kind."""
-    if not path.lower().endswith(_BESIDE):
+    """Return the coefficients in a text file by rasterio's names, whatever its name; None if it is of another kind."""
+    if not os.path.isfile(path) or os.path.getsize(path) > 100_000:  # no raster is read whole
         return None
+    text = Path(path).read_bytes().decode("latin-1")
+    values = re.split(r"[\s,;]+", text.strip(" \t\r\n,;"))
+    if re.fullmatch(r"[-+.\deE]+", "".join(values)) and len(values) in (90, 92):
+        text = "\n".join(f"{name}: {value}" for name, value in zip(_SINGLE + _LISTS, values[-90:], strict=True))
+    if re.search(r"^\s*lineNumCoef\s*=", text, re.IGNORECASE | re.MULTILINE):
+        return _read_by_gdal(text, ".RPB")
+    text = re.sub(r"[ \t]*[:=][ \t]*", ": ", text)  # GDAL reads no spaces before the colon
+    has_names = re.search(r"^\s*LINE_NUM_COEFF_20:", text, re.IGNORECASE | re.MULTILINE)
+    return _read_by_gdal(text, "_RPC.TXT") if has_names else None
+
+
+def _read_by_gdal(text: str, end: str) -> dict[str, Any]:
+    """Return what GDAL reads from a text whose file has a name with this end, beside an image."""
     with TemporaryDirectory() as folder:
         image = Path(folder) / "image.tif"
-        end = next(end for end in (".RPB", "_RPC.TXT") if path.lower().endswith(end.lower()))
-        shutil.copyfile(path, image.with_name(f"image{end}"))
+        image.with_name(f"image{end}").write_bytes(text.encode("latin-1"))
         with Env(), gdal.create(str(image), height=1, width=1, count=1, dtype=np.uint8) as dataset:
             dataset.write(np.ones((1, 1, 1), np.uint8))
         with gdal.reading(str(image)) as dataset:

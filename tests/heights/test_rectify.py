@@ -226,6 +226,46 @@ def test_models__of_all_files_give_the_same_images(kinds, made, raw, tmp_path):
         assert_allclose(read_model(model).inverse_loc(*place), read_model(file).inverse_loc(*place), rtol=0, atol=1e-9)
 
 
+def _write_text(path, file, *, separator=": ", unit="", names=True):
+    """Write the model in an image as text: a name before each value, or the values alone."""
+    with rasterio.open(file) as dataset:
+        known = dataset.rpcs.to_dict()
+    axes = "LINE", "SAMP", "LAT", "LONG", "HEIGHT"
+    single = [f"{axis}_{what}" for what in ("OFF", "SCALE") for axis in axes]
+    values = {name: known[name.lower()] for name in single}
+    for axis in ("LINE", "SAMP"):
+        for part in ("NUM", "DEN"):
+            numbers = known[f"{axis}_{part}_coeff".lower()]
+            values |= {f"{axis}_{part}_COEFF_{i}": number for i, number in enumerate(numbers, 1)}
+    lines = [
+        f"{name}{separator}{value:+.15e}{unit if name in single else ''}" if names else repr(value)
+        for name, value in values.items()
+    ]
+    path.write_text((separator if not names else "\r\n").join(lines) + "\r\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "form"),
+    [
+        ("left_RPC_ORG.TXT", {"unit": " pixels"}),
+        ("a.rpc", {"separator": "  =  "}),
+        ("b.dat", {"separator": " : "}),
+        ("values.txt", {"names": False, "separator": ", "}),
+        ("92.txt", {"names": False, "separator": "\n"}),
+    ],
+)
+def test_read_model__reads_texts_by_what_they_hold(name, form, raw, tmp_path):
+    from sat_intervals.heights.models import read_model
+
+    place = np.array([1.4497]), np.array([43.5983]), np.array([17.0])
+    file = _write_text(tmp_path / name, raw[1], **form)
+    if name == "92.txt":
+        file.write_text(f"0.8 0.3 {file.read_text()}")
+    expected = read_model(raw[1]).inverse_loc(*place)
+    assert_allclose(read_model(file).inverse_loc(*place), expected, rtol=0, atol=1e-9)
+
+
 def test_models__of_a_dimap_tile_and_of_nitf_are_those_of_the_image(raw, tmp_path):
     from sat_intervals.heights.models import read_model
     from sat_intervals.raster import find_model
