@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError, check_file
-from sat_intervals.raster import GROUND, Frame, Vertical
+from sat_intervals.raster import Frame, Vertical, is_ground
 
 # Points read at a time.
 _PART = 500_000
@@ -39,9 +39,8 @@ class PointFile:
         """Yield ``(n, 3)`` float64 x, y and height in the frame, of points that have all and are on the ground."""
         with _reading(self._path):
             for part in self._parts(self._path):
-                metres = part[:, 2] * self.frame.unit
-                is_ground = (metres >= GROUND[0]) & (metres <= GROUND[1])  # others are no-data values
-                yield part[np.isfinite(part).all(axis=1) & is_ground]
+                # other heights are no-data values
+                yield part[np.isfinite(part).all(axis=1) & is_ground(part[:, 2] * self.frame.unit)]
 
 
 @contextmanager

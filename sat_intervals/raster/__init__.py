@@ -6,7 +6,7 @@ from sat_intervals.raster.files import RUN_FILES, File, points_file, ranges_file
 from sat_intervals.raster.files_of import files_of
 from sat_intervals.raster.frame import Frame, Vertical
 from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing, between_180, footprint, horizontal_name
-from sat_intervals.raster.heightfield import GROUND, HeightRaster, warn_of_no_data
+from sat_intervals.raster.heightfield import GROUND, HeightRaster, is_ground, warn_of_no_data
 from sat_intervals.raster.identity import check_not_replaced
 from sat_intervals.raster.images import Image, check_pair, describe, open_image
 from sat_intervals.raster.layers import north_up, read_known, read_layers, read_shape, read_tags, write_layer
@@ -39,8 +39,8 @@ __all__ = [
     "OutputError", "OutputWriter", "Part", "Projection", "Vertical", "between_180", "check_free", "check_not_replaced",
     "check_pair", "check_reference", "check_space", "codec_versions", "compressed", "covered_window", "describe",
     "factors", "file_bytes", "files_of", "find_model", "footprint", "geoid_grid", "grid_mapping", "ground_of", "halved",
-    "horizontal_name", "is_surface", "new_file", "north_up", "open_image", "part_bytes", "points_file", "ranges_file",
-    "read_heights", "read_known", "read_layers", "read_place", "read_rpc_file", "read_shape", "read_small_image",
-    "read_small_layers", "read_tags", "read_views", "read_window", "resolution_of", "run_files", "surface_file",
-    "tags_beside", "truth_file", "utm_of", "warn_of_no_data", "write_file", "write_layer",
+    "horizontal_name", "is_ground", "is_surface", "new_file", "north_up", "open_image", "part_bytes", "points_file",
+    "ranges_file", "read_heights", "read_known", "read_layers", "read_place", "read_rpc_file", "read_shape",
+    "read_small_image", "read_small_layers", "read_tags", "read_views", "read_window", "resolution_of", "run_files",
+    "surface_file", "tags_beside", "truth_file", "utm_of", "warn_of_no_data", "write_file", "write_layer",
 ]  # fmt: skip

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from rasterio.io import DatasetReader
 from rasterio.transform import Affine
+from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster.frame import Frame, Places, Vertical
@@ -75,16 +76,22 @@ class HeightRaster:
         block = Window(i * _BLOCK, j * _BLOCK, _BLOCK, _BLOCK).clipped(Window(0, 0, *self.shape))
         pixels, state = read_window(self._image, block)
         heights = (pixels * self._scale + self._offset).astype(np.float32)
-        metres = heights * self.frame.unit
-        return np.where((state == 0) & (metres >= GROUND[0]) & (metres <= GROUND[1]), heights, np.float32(np.nan))
+        return np.where((state == 0) & is_ground(heights * self.frame.unit), heights, np.float32(np.nan))
 
 
-def warn_of_no_data(path: str | Path) -> None:
-    """Warn of a height that many cells have exactly, far from all others: no data that is not declared."""
+def is_ground(metres: np.ndarray) -> np.ndarray:
+    """Return which heights the ground on Earth can have."""
+    return np.asarray((metres >= GROUND[0]) & (metres <= GROUND[1]))
+
+
+def warn_of_no_data(path: str | Path, window: Window | None = None) -> None:
+    """Warn of a height that many cells of a part have exactly, far from all others: no data that is not declared."""
     with opened(str(path)) as dataset:
-        shape = min(_LOOKED, dataset.height), min(_LOOKED, dataset.width)
-        heights = dataset.read(1, out_shape=shape)[dataset.read_masks(1, out_shape=shape) != 0]
-    heights = heights[(heights >= GROUND[0]) & (heights <= GROUND[1])]
+        part = window or Window(0, 0, *dataset.shape)
+        shape = min(_LOOKED, part.height), min(_LOOKED, part.width)
+        where = {"window": RasterioWindow(part.column, part.row, part.width, part.height), "out_shape": shape}
+        heights = dataset.read(1, **where)[dataset.read_masks(1, **where) != 0]
+    heights = heights[is_ground(heights)]
     values, counts = np.unique(heights, return_counts=True)
     if values.size < 2:
         return

@@ -1,5 +1,6 @@
 """Read rasters on the grid of a surface model."""
 
+import logging
 from math import ceil, floor
 from pathlib import Path
 
@@ -9,18 +10,20 @@ from rasterio.crs import CRS
 from rasterio.enums import MaskFlags, Resampling
 from rasterio.transform import Affine, array_bounds
 from rasterio.vrt import WarpedVRT
-from rasterio.warp import calculate_default_transform, transform_bounds
+from rasterio.warp import calculate_default_transform, reproject, transform_bounds
 from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import SURFACE
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
-from sat_intervals.raster.heightfield import other_unit
+from sat_intervals.raster.heightfield import is_ground, other_unit, warn_of_no_data
 from sat_intervals.raster.images import opened
 from sat_intervals.tiling import Window
 
 Bounds = tuple[float, float, float, float]
+
+_LOG = logging.getLogger(__name__)
 
 
 def is_surface(path: Path) -> bool:
@@ -122,22 +125,24 @@ def ground_of(path: Path, bounds: Bounds, around: float) -> tuple[np.ndarray, Ge
     ``bounds``: least longitude and latitude, then the largest ones, of ground that it must cover; ``around``: degrees
     more, where unknown heights are the median of the others.
     """
-    _, place = read_place(path)
-    degrees = CRS.from_epsg(4326)
+    shape, place = read_place(path)
     west, south, east, north = bounds
-    with opened(str(path)) as dataset:
-        area = dataset.window(*transform_bounds("EPSG:4326", place.crs, *bounds))
-        whole, own = Window(0, 0, *dataset.shape), transform_bounds(place.crs, "EPSG:4326", *dataset.bounds)
-    window = Window.around(*zip(*area.toranges(), strict=True))
+    window, whole, degrees = _cells(place, bounds), Window(0, 0, *shape), CRS.from_epsg(4326)
     if window.clipped(whole) != window:
+        ends = array_bounds(*shape, place.transform)
+        own = transform_bounds(place.crs, degrees, ends[0], min(ends[1::2]), ends[2], max(ends[1::2]))
         raise SatIntervalsError(
             f"{path} does not cover the images, at longitudes {west:.4f} to {east:.4f}, latitudes {south:.4f} to "
             f"{north:.4f}, but only {own[0]:.4f} to {own[2]:.4f} and {own[1]:.4f} to {own[3]:.4f}: give a larger DEM"
         )
+    warn_of_no_data(path, window)
     cell = resolution_of(path, Georeferencing(crs=degrees))
     columns, rows = (ceil((last - first + 2 * around) / cell) for first, last in ((west, east), (south, north)))
     grid = Georeferencing(crs=degrees, transform=Affine(cell, 0, west - around, 0, -cell, north + around))
-    heights = read_heights(path, grid, (rows, columns), Window(0, 0, rows, columns), smooth=True)
+    near = _cells(place, (west - around, south - around, east + around, north + around)).grown(2, 2).clipped(whole)
+    heights, given = np.full((rows, columns), np.nan), {"src_crs": place.crs, "src_nodata": np.nan}
+    wanted = {"dst_crs": degrees, "dst_transform": grid.transform, "resampling": Resampling.bilinear}
+    reproject(_known(path, near), heights, src_transform=place.shifted(near).transform, **given, **wanted)
     margin = floor(around / cell)
     outside = np.ones(heights.shape, bool)
     outside[margin : rows - margin, margin : columns - margin] = False
@@ -146,3 +151,28 @@ def ground_of(path: Path, bounds: Bounds, around: float) -> tuple[np.ndarray, Ge
         raise SatIntervalsError(f"{path} has no heights at the images: give a DEM that has some there")
     heights[outside & np.isnan(heights)] = np.median(known)
     return heights, grid
+
+
+def _cells(place: Georeferencing, bounds: Bounds) -> Window:
+    """Return the cells of a raster, north or south up, around bounds in degrees."""
+    assert place.transform is not None
+    a, _, c, _, e, f = place.transform[:6]
+    left, bottom, right, top = transform_bounds("EPSG:4326", place.crs, *bounds)
+    rows, columns = sorted(((bottom - f) / e, (top - f) / e)), sorted(((left - c) / a, (right - c) / a))
+    return Window.around(*zip(rows, columns, strict=True))
+
+
+def _known(path: Path, window: Window) -> np.ndarray:
+    """Read heights of a window of a raster, NaN where they are unknown; warn of those that no ground has."""
+    with opened(str(path), window) as dataset:
+        area = RasterioWindow(window.column, window.row, window.width, window.height)
+        pixels = np.where(dataset.read_masks(1, window=area) == 0, np.nan, dataset.read(1, window=area))
+        heights = pixels * dataset.scales[0] + dataset.offsets[0]
+    wild = pixels[np.isfinite(heights) & ~is_ground(heights)]
+    if wild.size:
+        _LOG.warning(
+            "%s: %.1f %% of its heights near the images are left out, such as %.9g, which no ground has: declare it as "
+            "no data: rio edit-info --nodata %.9g %s",
+            *(path, 100 * wild.size / pixels.size, wild[0], wild[0], path),
+        )
+    return np.where(is_ground(heights), heights, np.nan)

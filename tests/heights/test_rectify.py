@@ -411,6 +411,31 @@ def test_rectify__a_projected_dem_is_as_one_in_degrees(raw, tmp_path):
     assert_allclose(other.right, one.right, rtol=0, atol=0.05)
 
 
+def test_epipolar_geometry__names_undeclared_voids_of_a_dem_and_turns_it(raw, tmp_path, caplog):
+    from surfaces import write_raster
+
+    from sat_intervals.heights.epipolar import Terrain, epipolar_geometry
+
+    def grid_of(value, *, up=-1):
+        heights = 15 + 0.1 * np.arange(300.0) + np.zeros((1, 300, 1))
+        heights[:, 154:160, 155:161] = value  # 0.04 % of the DEM, more of the images
+        place = Affine(2e-4, 0, 1.42, 0, up * 2e-4, 43.63 if up < 0 else 43.57)
+        dem = write_raster(tmp_path / "dem.tif", heights[:, ::-up], place, "EPSG:4326")
+        caplog.clear()
+        return epipolar_geometry(*sensor_images(raw[0].parent), Terrain(dem), "coarser").right
+
+    expected = grid_of(np.nan)
+    assert not caplog.text
+    for value in (-32767, 21000):
+        assert_array_equal(grid_of(value), expected)
+        assert f"such as {value}, which no ground has: declare it as no data: rio edit-info --nodata {value} " in (
+            caplog.text
+        )
+    assert_allclose(grid_of(np.nan, up=1), expected, rtol=0, atol=1e-6)
+    grid_of(-35)
+    assert re.search(r"dem.tif: \d\.\d % of its heights are exactly -35, .* rio edit-info --nodata -35 ", caplog.text)
+
+
 def test_rectify__a_dem_that_just_covers_is_enough_and_bad_ones_are_refused_in_one_line(made, raw, tmp_path):
     from surfaces import write_raster
 
