@@ -31,7 +31,7 @@ def batch(pairs: Path, out: Path, as_json: bool, settings: SettingsArguments, ru
     from sat_intervals.run.batch import Steps, match_batch
 
     check_not_replaced([pairs, settings.file], [out / REPORT])
-    rows = read_batch(pairs)
+    rows, doubts = read_batch(pairs), list[str]()
     with Console(run.quiet or as_json) as console:
         report = match_batch(
             rows,
@@ -41,7 +41,7 @@ def batch(pairs: Path, out: Path, as_json: bool, settings: SettingsArguments, ru
             overwrite=run.overwrite,
             keep_tiles=run.keep_tiles,
             progress=console.progress,
-            steps=Steps(epipolar_pairs(out, console, overwrite=run.overwrite), surfaces_of(rows, out, console)),
+            steps=Steps(epipolar_pairs(out, console, doubts, overwrite=run.overwrite), surfaces_of(rows, out, console)),
         )
     if as_json:
         say_json(report)
@@ -60,4 +60,5 @@ def batch(pairs: Path, out: Path, as_json: bool, settings: SettingsArguments, ru
             f"{len(failed)} of {len(report)} pairs failed; fix the causes and rerun the same command: it matches only "
             f"the missing pairs:\n{lines}"
         )
-    run.check_strict([*(line for end in report.values() for line in end.get("warnings", ())), *of_surfaces])
+    of_runs = [line for end in report.values() for line in end.get("warnings", ())]
+    run.check_strict([*doubts, *of_runs, *of_surfaces])

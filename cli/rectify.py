@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from sat_intervals.cli.logs import warn
 from sat_intervals.cli.matching import PairArguments, image_options
 from sat_intervals.cli.options import (
     FILE,
@@ -102,9 +103,10 @@ def rectified(
     console: "Console",
     rows: bool,
 ) -> dict[str, Any]:
-    """Rectify a pair and print its figures; ``rows``: compare the rows of the new images, too."""
+    """Rectify a pair and print its figures; ``rows``: compare rows, too. The record gets ``warnings``."""
     from sat_intervals.heights.epipolar import Terrain
     from sat_intervals.heights.rectify import RawPair, rectify
+    from sat_intervals.run.quality import doubts_of_images
     from sat_intervals.run.rows import compared_rows
 
     left, right = pair.open()
@@ -112,6 +114,7 @@ def rectified(
     raw_pair = RawPair(left, right, models, terrain, raw["resolution_of"] or "coarser")
     compare = partial(compared_rows, progress=console.progress) if rows else None
     record = rectify(raw_pair, out, overwrite=overwrite, compare=compare, progress=console.progress)
+    warn(doubts := doubts_of_images(left, right))
     for side in ("left", "right"):
         console.say(f"model of the {side} image: {record['inputs'][f'{side}_model']['path']}")
     height = "a DEM" if record["altitude"] is None else f"{record['altitude']:.0f} m"
@@ -122,6 +125,5 @@ def rectified(
     )
     if found := record["rows"]:
         console.say(f"rows: {found['text']}")
-        for line in found["warnings"]:
-            click.echo(f"warning: {line}", err=True)
-    return record
+        warn(found["warnings"])
+    return record | {"warnings": doubts}

@@ -71,7 +71,7 @@ def surface(
         _check(cells, resolved(config).interval)
         raw |= {"geoid": cells["geoid"] if raw["dem"] else None}
         given, images = sensor_files[0] if sensor_files else (), pair.files
-        pair, files = _epipolar(pair, given, raw, out, console, overwrite=run.overwrite)
+        pair, files, doubts = _epipolar(pair, given, raw, out, console, overwrite=run.overwrite)
         _check_kept(out, cells, [*files, *images], settings.file)
         Sensors.load(*map(Path, files))  # raises before hours of matching
         left, right = pair.open()
@@ -82,7 +82,7 @@ def surface(
     console.summary(report, out)
     say_surface(console, made)
     console.say(str(out / "dsm.tif"))
-    run.check_strict([*report["warnings"], *geometry_warnings(made["geometry"])])
+    run.check_strict([*doubts, *report["warnings"], *geometry_warnings(made["geometry"])])
 
 
 def _epipolar(
@@ -93,8 +93,8 @@ def _epipolar(
     console: "Console",
     *,
     overwrite: bool,
-) -> tuple[PairArguments, SensorFiles]:
-    """Return an epipolar pair with its models and grids; raw images are rectified in the folder of the run."""
+) -> tuple[PairArguments, SensorFiles, list[str]]:
+    """Return an epipolar pair, models and grids, and warnings; raw images are rectified in the folder of the run."""
     from sat_intervals.heights.rectified import IMAGES, rectified_files
 
     has_grids = len(given) > len(IMAGES)
@@ -105,14 +105,14 @@ def _epipolar(
         }
         for name in (name for name, is_given in options.items() if is_given):
             raise click.UsageError(f"{name} is for raw images, {pair.images[0]} is an epipolar image: leave it out.")
-        return pair, made
+        return pair, made, []
     if pair.window:
         raise click.UsageError("--window is a region of an epipolar image: rectify these raw images, then match them.")
-    rectified(pair, out, tuple(given) or (None, None), raw, overwrite=overwrite, console=console, rows=False)
+    record = rectified(pair, out, tuple(given) or (None, None), raw, overwrite=overwrite, console=console, rows=False)
     left, right = (str(out / name) for name in IMAGES)
     made = rectified_files(left, right)
     assert made
-    return PairArguments((left, right), (None, None), (None, None), (None, None), None), made
+    return PairArguments((left, right), (None, None), (None, None), (None, None), None), made, record["warnings"]
 
 
 def _check_kept(
@@ -197,8 +197,8 @@ def _has_grids(pair: "PairOfBatch") -> bool:
     return len(pair.sensors or ()) > 2
 
 
-def epipolar_pairs(out: Path, console: "Console", *, overwrite: bool) -> "Begin":
-    """Return a function that makes the epipolar pair of a pair of a batch, if its row asks for a surface."""
+def epipolar_pairs(out: Path, console: "Console", doubts: list[str], *, overwrite: bool) -> "Begin":
+    """Return a function that makes the epipolar pair of a pair of a batch for a surface, and adds to its ``doubts``."""
     from sat_intervals.tiling import Window
 
     def epipolar(pair: "PairOfBatch") -> "PairOfBatch":
@@ -213,7 +213,8 @@ def epipolar_pairs(out: Path, console: "Console", *, overwrite: bool) -> "Begin"
         images = PairArguments((pair.left, pair.right), (pair.left_mask, pair.right_mask), nodata, band, window)
         raw = {"dem": None, "altitude": None, "geoid": None, "resolution_of": None}
         given = tuple(map(Path, pair.sensors or ()))
-        made, files = _epipolar(images, given, raw, out / pair.name, console, overwrite=overwrite)
+        made, files, found = _epipolar(images, given, raw, out / pair.name, console, overwrite=overwrite)
+        doubts.extend(found)
         left, right = made.images
         masks = dict(zip(("left_mask", "right_mask"), made.masks, strict=True))
         reading = pair.reading if made is images else {}

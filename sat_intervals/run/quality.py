@@ -42,14 +42,34 @@ def quality_of(job: Job, tables: Tables) -> dict[str, Any]:
     ``noise``, see `noise_of`; ``collars``, see `Found`; ``no_data``, the share of pixels without data that tiles have
     read of each side; ``same``, whether both images have the same pixels.
     """
-    sides, region = {"left": job.left, "right": job.right}, job.store.grid.region
-    plain = {side: _lines(image, region, _ROWS) for side, image in sides.items() if is_plain(image)}
-    collars = {side: collar for side, (pixels, state) in plain.items() if (collar := _collar(pixels, state))}
-    collars |= job.found.collars if job.found else {}
-    (left, _), (right, state) = (_lines(image, region, 1) for image in sides.values())
-    same = left.size > 0 and (state == 0).any() and bool(np.array_equal(left, right))
-    noise = job.survey and job.survey.noise
-    return {"noise": noise, "collars": collars, "no_data": _no_data(job, tables), "same": same}
+    looked = _look(job.left, job.right, job.store.grid.region) | {"no_data": _no_data(job, tables)}
+    looked["collars"] |= job.found.collars if job.found else {}
+    return looked | {"noise": job.survey and job.survey.noise}
+
+
+def _look(left: Image, right: Image, region: Window) -> dict[str, Any]:
+    """Return ``collars``, whether there is ``no_data``, and ``same``, see `quality_of`, by some rows of both images."""
+    sides = {"left": left, "right": right}
+    lines = {side: _lines(image, region, _ROWS) for side, image in sides.items()}
+    plain = (side for side, image in sides.items() if is_plain(image))
+    collars = {side: collar for side in plain if (collar := _collar(*lines[side]))}
+    (first, _), (second, state) = (_lines(image, region, 1) for image in sides.values())
+    same = bool(first.size and (state == 0).any() and np.array_equal(first, second))
+    has_none = {side: bool((state != 0).any()) for side, (_, state) in lines.items()}
+    return {"collars": collars, "no_data": has_none, "same": same}
+
+
+def doubts_of_images(left: Image, right: Image, looked: Mapping[str, Any] | None = None) -> list[str]:
+    """Return warnings of equal images, and of no data that is not declared or that no pixel is; by default look."""
+    looked = looked or _look(left, right, Window(0, 0, max(left.height, right.height), max(left.width, right.width)))
+    lines = collar_lines(looked["collars"], (left.path, right.path))
+    if looked["same"]:
+        lines.insert(0, f"{left.path} and {right.path} have the same pixels: give the left and the right image")
+    given = [(side, image) for side, image in (("left", left), ("right", right)) if image.nodata_given]
+    if given and not any(looked["no_data"][side] for side, _ in given):
+        path, nodata = given[0][1].path, given[0][1].nodata
+        lines.append(f"{path}: no pixel that was read is {nodata:.9g}, the no-data value given: check it")
+    return lines
 
 
 def _no_data(job: Job, tables: Tables) -> dict[str, float]:
@@ -91,9 +111,7 @@ def _collar(pixels: np.ndarray, state: np.ndarray) -> dict[str, float] | None:
 def warnings_of(job: Job, counts: Mapping[str, Any], quality: Mapping[str, Any]) -> list[str]:
     """Return the warnings about a run, one line each, the likeliest cause of all others first."""
     paths, config, found = (job.left.path, job.right.path), job.config, job.survey and job.survey.rows
-    of_data = [*collar_lines(quality["collars"], paths), *_doubts_of_no_data(job, counts, quality["no_data"])]
-    if quality["same"]:
-        of_data.insert(0, f"{paths[0]} and {paths[1]} have the same pixels: give the left and the right image")
+    of_data = [*doubts_of_images(job.left, job.right, quality), *_spoiled(job, counts, quality["no_data"]["left"])]
     rows = rows_left(job.survey, config.rows, job.right.path)
     was_found = job.found is not None
     of_range = _doubts_of_range(counts, config.disparity, paths[0], was_found=was_found)
@@ -112,20 +130,15 @@ def warnings_of(job: Job, counts: Mapping[str, Any], quality: Mapping[str, Any])
     return [*of_data, *of_pair, *noise, *([f"{paths[0]}: {missed}"] if missed else [])]
 
 
-def _doubts_of_no_data(job: Job, counts: Mapping[str, Any], no_data: Mapping[str, float]) -> list[str]:
-    """Return warnings of a no-data value that no pixel has, and of isolated pixels that spoil many windows."""
-    given = {side: image for side, image in (("left", job.left), ("right", job.right)) if image.nodata_given}
-    lines = []
-    if given and not any(no_data[side] for side in given):
-        image = next(iter(given.values()))
-        lines.append(f"{image.path}: no pixel that was read is {image.nodata:.9g}, the no-data value given: check it")
+def _spoiled(job: Job, counts: Mapping[str, Any], no_data: float) -> list[str]:
+    """Return a warning of isolated pixels without data, a share of the left image, that spoil many windows."""
     spoiled = counts["causes"]["left_window"] / max(1, counts["pixels"])
-    if spoiled > _SPOILED and spoiled > 3 * no_data["left"]:
-        lines.append(
-            f"{job.left.path}: {100 * no_data['left']:.1f} % of the pixels are no data or masked, but spoil the "
-            f"windows of {100 * spoiled:.0f} %: they are isolated: fill them, or check no data and masks"
-        )
-    return lines
+    if spoiled <= _SPOILED or spoiled <= 3 * no_data:
+        return []
+    return [
+        f"{job.left.path}: {100 * no_data:.1f} % of the pixels are no data or masked, but spoil the windows of "
+        f"{100 * spoiled:.0f} %: they are isolated: fill them, or check no data and masks"
+    ]
 
 
 def _rejected(counts: Mapping[str, Any], paths: tuple[str, str], *, was_found: bool) -> list[str]:

@@ -424,16 +424,18 @@ def test_epipolar_geometry__names_undeclared_voids_of_a_dem_and_turns_it(raw, tm
         caplog.clear()
         return epipolar_geometry(*sensor_images(raw[0].parent), Terrain(dem), "coarser").right
 
+    def named(value):
+        line = rf"dem.tif: \d\.\d % of its heights are exactly {value}, .* rio edit-info --nodata {value} "
+        return re.search(line, caplog.text)
+
     expected = grid_of(np.nan)
     assert not caplog.text
     for value in (-32767, 21000):
         assert_array_equal(grid_of(value), expected)
-        assert f"such as {value}, which no ground has: declare it as no data: rio edit-info --nodata {value} " in (
-            caplog.text
-        )
+        assert named(value)
     assert_allclose(grid_of(np.nan, up=1), expected, rtol=0, atol=1e-6)
     grid_of(-35)
-    assert re.search(r"dem.tif: \d\.\d % of its heights are exactly -35, .* rio edit-info --nodata -35 ", caplog.text)
+    assert named(-35)
 
 
 def test_rectify__a_dem_that_just_covers_is_enough_and_bad_ones_are_refused_in_one_line(made, raw, tmp_path):
@@ -576,6 +578,44 @@ def test_batch__makes_surfaces_of_raw_pairs(made, raw, tmp_path):
     rerun = invoke("batch", tmp_path / "pairs.json", tmp_path / "out")
     assert "resampling" not in rerun.output
     assert contents(tmp_path / "out" / "raw") == before
+
+
+def _with_collar(folder, raw, collar, scale=1):
+    """Write a raw pair whose empty corners have a value that nothing declares."""
+    paths = [folder / f"collar_{file.name}" for file in raw]
+    for file, path in zip(raw, paths, strict=True):
+        with rasterio.open(file) as dataset:
+            pixels, profile, rpcs = dataset.read() * scale, dataset.profile, dataset.rpcs
+        pixels[pixels == 0] = collar
+        with rasterio.open(path, "w", **profile | {"nodata": None, "dtype": pixels.dtype}, rpcs=rpcs) as dataset:
+            dataset.write(pixels)
+    return paths
+
+
+@pytest.mark.parametrize(("collar", "scale"), [(0, 1), (11, 1), (0, np.float32(1 / 4096))])
+def test_rectify__names_undeclared_no_data_of_the_raw_images(raw, tmp_path, collar, scale):
+    left, right = _with_collar(tmp_path, raw, collar, scale)
+    result = invoke("rectify", left, right, tmp_path / "out", "--json")
+    warned = json.loads(result.stdout)["warnings"]
+    assert [f"warning: {line}" for line in warned] == [line for line in result.stderr.splitlines() if "exactly" in line]
+    for path, line in zip((left, right), warned, strict=True):
+        assert re.fullmatch(rf"{path}: \d\d % of the pixels are exactly {collar}, .* give --nodata {collar}", line)
+    declared = invoke("rectify", left, right, tmp_path / "declared", "--nodata", collar, "--json")
+    assert json.loads(declared.stdout)["warnings"] == []
+    twice = invoke("rectify", left, left, tmp_path / "twice", "--nodata", collar, "--right-model", right)
+    assert f"{left} and {left} have the same pixels: give the left and the right image" in twice.stderr
+
+
+def test_surface_and_batch__are_strict_about_the_raw_images(raw, tmp_path):
+    left, right = _with_collar(tmp_path, raw, 7)
+    words = "--disparity", -60, 20, "--strict", "--quiet"
+    result = invoke("surface", left, right, tmp_path / "out", *SETTINGS, *words)
+    (tmp_path / "pairs.csv").write_text(f"name,left,right,minimum,maximum,resolution\npair,{left},{right},-60,20,0.5\n")
+    of_batch = invoke("batch", tmp_path / "pairs.csv", tmp_path / "batch", "--strict", "--quiet")
+    for one in (result, of_batch):
+        assert one.exit_code == 1
+        assert one.stderr.count("if it is no data, give --nodata 7") == 2
+        assert "warnings, see above, and --strict is given" in one.stderr
 
 
 def test_rectify__masks_grow_by_the_pixels_around_and_no_value_becomes_no_data(made, raw, tmp_path):

@@ -10,7 +10,7 @@ from helpers import PLACE, invoke, write_pair
 from sat_intervals import SatIntervalsError, load_config, match_pair
 from sat_intervals.demo import make_scene
 from sat_intervals.raster import open_image, write_layer
-from sat_intervals.run.quality import verdict_of
+from sat_intervals.run.quality import doubts_of_images, verdict_of
 
 
 @pytest.fixture(scope="module")
@@ -76,6 +76,17 @@ def test_warnings_of__the_same_image_twice(scene, tmp_path):
         copy.write(file.read())
     report = match_pair(tmp_path / "left.tif", tmp_path / "copy.tif", tmp_path / "out")
     assert report["warnings"][0].endswith("have the same pixels: give the left and the right image")
+
+
+def test_doubts_of_images__of_two_sizes(scene, tmp_path):
+    left, right = lows(scene, tmp_path, "left"), tmp_path / "right.tif"
+    write_layer(right, scene.right[:200, :290].astype(np.uint16) + 2000, 2000, PLACE)
+    (line,) = doubts_of_images(open_image(left), open_image(right))
+    assert line.startswith(f"{left}: 17 % of the pixels are exactly 777, along its borders")
+    given = [open_image(image, nodata=value) for image, value in ((left, 777), (right, None))]
+    assert doubts_of_images(*given) == []
+    (line,) = doubts_of_images(open_image(left, nodata=778), open_image(right))
+    assert line == f"{left}: no pixel that was read is 778, the no-data value given: check it"
 
 
 def test_warnings_of__isolated_pixels_without_data(scene, tmp_path):
