@@ -28,7 +28,7 @@ _SUSPECT_HEIGHT, _SUSPECT_ROWS = 10.0, 0.5
 @click.command(short_help="Turn reference heights into true disparities of a run.")
 @click.argument("out", type=FILE)
 @click.option("--heights", type=FILE, help="Raster of heights, in any CRS.")
-@click.option("--points", type=FILE, help="Points: CSV, LAS, LAZ, GeoPackage.")
+@click.option("--points", type=FILE, help="Points: CSV, Parquet, LAS, LAZ, GeoPackage.")
 @click.option("--ellipsoid", is_flag=True, help="Heights are above the ellipsoid of WGS 84.")
 @click.option("--geoid", type=FILE, help="Geoid grid (GTX, GeoTIFF) that heights refer to.")
 @click.option("--crs", metavar="EPSG", help="CRS of the heights, in place of the file's.")
@@ -57,13 +57,13 @@ def reference(
 
     Give it to calibrate or evaluate as --truth. It has the disparity of the height that the left sensor sees at each
     pixel, and NaN elsewhere. Heights need a CRS and what they refer to: --ellipsoid or --geoid, unless the file says
-    so. A CSV file has the columns longitude, latitude, height, or x, y, height with --crs.
+    so. A CSV or Parquet file has the columns longitude, latitude, height, or x, y, height with --crs.
 
     The reference is first moved by its constant shift from the heights of the run (easting, northing, height), which
     is printed with its standard deviation. On flat ground only the height is moved.
 
-    Models and grids are those of `dsm`. Needs shareloc: pip install 'sat-intervals[dsm]'; points other than CSV
-    need pip install 'sat-intervals[reference]'.
+    Models and grids are those of `dsm`. Needs shareloc: pip install 'sat-intervals[dsm]'; points need pip install
+    'sat-intervals[reference]'.
     """
     if (heights is None) == (points is None):
         raise click.UsageError("give either --heights or --points.")

@@ -34,6 +34,7 @@ HOMES = {
     "laspy": "heights",
     "numba": "kernels",
     "onnxruntime": "match",
+    "pyarrow": "heights",
     "pyogrio": "heights",
     "pyproj": "raster",
     "rasterio": "raster",

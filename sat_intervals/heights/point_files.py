@@ -1,9 +1,10 @@
-"""Read points with heights in parts: CSV, GeoPackage and other vector files (pyogrio), LAS and LAZ (laspy)."""
+"""Read points with heights in parts: CSV and Parquet (pyarrow), vector files (pyogrio), LAS and LAZ (laspy)."""
 
-import csv
-from collections.abc import Iterator
+import json
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,25 +13,28 @@ from sat_intervals.raster import Frame, Vertical, is_ground
 
 # Points read at a time.
 _PART = 500_000
-# Names of columns, in lower case; the first found counts. Those of ICESat-2 products are among them.
-_DEGREES = (("longitude", "lon", "long"), ("latitude", "lat"))
+# Names of columns, in lower case; the first found counts. Those of ICESat-2 and GEDI products are among them.
+_DEGREES = (("longitude", "lon", "long", "lon_lowestmode"), ("latitude", "lat", "lat_lowestmode"))
 _METRES = (("x", "easting", "east"), ("y", "northing", "north"))
-_HEIGHTS = ("height", "h", "z", "elevation", "ellipsoidal_height", "h_mean", "h_te_best_fit", "h_te_median", "h_ph")
+_HEIGHTS = (
+    "height", "h", "z", "elevation", "ellipsoidal_height", "h_mean", "h_te_best_fit", "h_te_median", "h_ph", "h_li",
+    "elev_lowestmode", "elevation_lm")  # fmt: skip
+_GEOMETRIES = "wkt", "geometry", "geom", "the_geom"
 # Classes of LAS points that are noise.
 _NOISE = 7, 18
 
 
 class PointFile:
-    """Points of a CSV file with a header, LAS, LAZ, or vectors that GDAL reads; ``crs`` replaces that of the file.
+    """Points of a CSV file with a header, Parquet, LAS, LAZ, or vectors of GDAL; ``crs`` replaces that of the file.
 
-    Longitude and latitude of a CSV file are on the WGS 84 ellipsoid without ``crs``.
+    Columns of longitude and latitude are on the WGS 84 ellipsoid without ``crs``.
     """
 
     def __init__(self, path: Path, crs: str | None, vertical: Vertical) -> None:
         check_file(path, "give a file of points")
         self._path, ending = path, path.suffix.lower()
-        readers = {".csv": (_crs_of_table, _table), ".las": (_crs_of_las, _las), ".laz": (_crs_of_las, _las)}
-        crs_of, self._parts = readers.get(ending, (_crs_of_vectors, _vectors))
+        is_cloud = ending in (".las", ".laz")
+        crs_of, self._parts = (_crs_of_las, _las) if is_cloud else (_crs_of_table, _of_table)
         with _reading(path):
             own = crs_of(path)
         self.frame = Frame(str(path), crs or own, vertical)
@@ -54,58 +58,97 @@ def _reading(path: Path) -> Iterator[None]:
         raise SatIntervalsError(f"{path} needs {error.name}: pip install 'sat-intervals[reference]'") from error
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise SatIntervalsError(f"{path} cannot be read as points: {reason}") from error
+        raise SatIntervalsError(f"{path} cannot be read as points: {reason}: correct or convert it") from error
 
 
-def _columns(path: Path, names: list[str]) -> tuple[list[int], bool]:
-    """Return the columns of x, y and height in a table, and whether x and y are degrees."""
-    known = [name.strip().lower() for name in names]
+@contextmanager
+def _table(path: Path, columns: Sequence[str] = ()) -> Iterator[tuple[Any, ...]]:
+    """Yield names of columns, that of the geometry and the CRS, if a file says so, and Arrow's batches of columns."""
+    ending, chosen = path.suffix.lower(), list(columns) or None
+    if ending == ".csv":
+        with _csv(path, chosen) as batches:
+            yield batches.schema.names, None, None, batches
+    elif ending in (".parquet", ".geoparquet", ".pq"):
+        from pyarrow.parquet import ParquetFile
 
-    def place(choices: tuple[str, ...]) -> int | None:
-        return next((known.index(name) for name in choices if name in known), None)
+        file = ParquetFile(path)
+        known = json.loads((file.schema_arrow.metadata or {}).get(b"geo", "{}"))
+        geometry = known.get("primary_column")
+        crs = known["columns"][geometry].get("crs", "OGC:CRS84") if known else None
+        crs = json.dumps(crs) if isinstance(crs, dict) else crs
+        yield file.schema_arrow.names, geometry, crs, file.iter_batches(columns=chosen)
+    else:
+        from pyogrio.raw import open_arrow
 
-    height = place(_HEIGHTS)
+        with open_arrow(path, use_pyarrow=True) as (known, batches):
+            names = batches.schema.names
+            geometry = next((name for name in (known["geometry_name"], "wkb_geometry") if name in names), None)
+            yield names, geometry, known["crs"], batches
+
+
+def _csv(path: Path, columns: list[str] | None) -> Any:
+    """Open a table whose separator is in its first line; with semicolons, numbers may have a decimal comma."""
+    from pyarrow import csv, float64
+
+    with path.open(encoding="utf-8-sig", errors="replace") as stream:
+        first, second = stream.readline(), stream.readline()
+    separator = max(",;\t", key=first.count)
+    numbers = {name: float64() for name in columns or () if name.strip().lower() not in _GEOMETRIES}
+    point = "," if separator == ";" and "," in second else "."
+    options = csv.ConvertOptions(include_columns=columns, column_types=numbers, decimal_point=point)
+    reading = csv.ReadOptions(use_threads=False)  # so that errors name the line
+    return csv.open_csv(path, reading, csv.ParseOptions(delimiter=separator), options)
+
+
+def _columns(path: Path, names: list[str], geometry: str | None) -> tuple[list[str], bool]:
+    """Return the columns of x, y and height, or of geometry and height if any, and whether x and y are degrees."""
+    known = {name.strip().lower(): name for name in names}
+    height = next((known[name] for name in _HEIGHTS if name in known), None)
     for axes, is_degrees in ((_DEGREES, True), (_METRES, False)):
-        x, y = map(place, axes)
-        if x is not None and y is not None and height is not None:
+        x, y = (next((known[name] for name in choices if name in known), None) for choices in axes)
+        if x and y and height and not geometry:
             return [x, y, height], is_degrees
+    geometry = geometry or next((known[name] for name in _GEOMETRIES if name in known), None)
+    if geometry:
+        return [geometry, *([height] if height else [])], False
     raise SatIntervalsError(
         f"{path} has the columns {', '.join(names)[:200]}: name them longitude, latitude, height, or x, y, height with "
         "--crs"
     )
 
 
-def _header(path: Path) -> list[str]:
-    with path.open(newline="", encoding="utf-8-sig") as stream:
-        return next(csv.reader(stream), [])
-
-
 def _crs_of_table(path: Path) -> str | None:
-    return "EPSG:4326" if _columns(path, _header(path))[1] else None
+    with _table(path) as (names, geometry, crs, _):
+        return "EPSG:4326" if _columns(path, names, geometry)[1] else crs
 
 
-def _table(path: Path) -> Iterator[np.ndarray]:
-    chosen, _ = _columns(path, _header(path))
-    with path.open(newline="", encoding="utf-8-sig") as stream:
-        lines = csv.reader(stream)
-        next(lines)
-        part: list[list[float]] = []
-        for line in lines:
-            if line:
-                part.append([_number(path, lines.line_num, line, place) for place in chosen])
-            if len(part) == _PART:
-                yield np.array(part)
-                part = []
-        if part:
-            yield np.array(part)
+def _of_table(path: Path) -> Iterator[np.ndarray]:
+    """Yield points; the height is that of the geometry, unless it is constant or missing beside a column of heights."""
+    with _table(path) as (names, geometry, *_):
+        chosen, _ = _columns(path, names, geometry)
+    uses_column = None
+    with _table(path, chosen) as (*_, batches):
+        for batch in batches:
+            values = [batch.column(name).to_numpy(zero_copy_only=False) for name in chosen]
+            places = np.column_stack(values).astype(np.float64) if len(chosen) == 3 else _places(path, *values)
+            if uses_column is None:  # the first batch decides for all
+                uses_column = len(chosen) == 2 and np.unique(places[np.isfinite(places[:, 2]), 2]).size < 2
+            if uses_column:
+                places[:, 2] = values[1]
+            yield places
 
 
-def _number(path: Path, line: int, cells: list[str], place: int) -> float:
-    try:
-        return float(cells[place]) if cells[place].strip() else float("nan")
-    except (ValueError, IndexError) as error:
-        cell = cells[place] if place < len(cells) else "nothing"
-        raise SatIntervalsError(f"{path}, line {line}: {cell!r} is not a number: fix this line") from error
+def _places(path: Path, geometry: np.ndarray, heights: np.ndarray | None = None) -> np.ndarray:
+    """Return ``(n, 3)`` x, y and Z of points as WKB or WKT."""
+    import shapely
+
+    is_text = any(isinstance(one, str) for one in geometry)
+    points = shapely.from_wkt(geometry) if is_text else shapely.from_wkb(geometry)
+    if set(np.unique(shapely.get_type_id(points))) - {-1, 0}:
+        raise SatIntervalsError(f"{path} has geometries that are not points: give points")
+    if heights is None and not shapely.has_z(points).any():
+        raise SatIntervalsError(f"{path} has points without heights: give 3D points, or a column named height")
+    return np.column_stack([shapely.get_x(points), shapely.get_y(points), shapely.get_z(points)])
 
 
 def _crs_of_las(path: Path) -> str | None:
@@ -124,36 +167,3 @@ def _las(path: Path) -> Iterator[np.ndarray]:
         for points in file.chunk_iterator(_PART):
             kept = ~np.isin(np.asarray(points.classification), _NOISE) & (np.asarray(points.withheld) == 0)
             yield np.column_stack([points.x, points.y, points.z])[kept]
-
-
-def _crs_of_vectors(path: Path) -> str | None:
-    import pyogrio
-
-    crs = pyogrio.read_info(path)["crs"]
-    return None if crs is None else str(crs)
-
-
-def _vectors(path: Path) -> Iterator[np.ndarray]:
-    """Yield points of the first layer; the height is that of the geometry, else a column."""
-    import pyogrio
-    import shapely
-
-    fields = [str(name) for name in pyogrio.read_info(path)["fields"]]
-    column = next((name for choice in _HEIGHTS for name in fields if name.lower() == choice), None)
-    skipped = 0
-    while True:
-        _, _, geometry, values = pyogrio.raw.read(
-            path, columns=[column] if column else [], skip_features=skipped, max_features=_PART
-        )
-        if not len(geometry):
-            return
-        skipped += len(geometry)
-        points = shapely.from_wkb(geometry)
-        if set(np.unique(shapely.get_type_id(points))) - {-1, 0}:
-            raise SatIntervalsError(f"{path} has geometries that are not points: give points")
-        places = np.column_stack([shapely.get_x(points), shapely.get_y(points), shapely.get_z(points)])
-        if column and not np.isfinite(places[:, 2]).any():
-            places[:, 2] = values[0]
-        elif not column and not shapely.has_z(points).any():
-            raise SatIntervalsError(f"{path} has points without heights: give 3D points, or a column named height")
-        yield places

@@ -85,13 +85,13 @@ def is_ground(metres: np.ndarray) -> np.ndarray:
 
 
 def warn_of_no_data(path: str | Path, window: Window | None = None) -> None:
-    """Warn of a height that many cells of a part have exactly, far from all others: no data that is not declared."""
+    """Warn of a height that many cells have exactly, far from others; in a window, also of one that no ground has."""
     with opened(str(path)) as dataset:
         part = window or Window(0, 0, *dataset.shape)
         shape = min(_LOOKED, part.height), min(_LOOKED, part.width)
         where = {"window": RasterioWindow(part.column, part.row, part.width, part.height), "out_shape": shape}
         heights = dataset.read(1, **where)[dataset.read_masks(1, **where) != 0]
-    heights = heights[is_ground(heights)]
+    heights = heights[np.isfinite(heights) if window else is_ground(heights)]
     values, counts = np.unique(heights, return_counts=True)
     if values.size < 2:
         return

@@ -39,15 +39,11 @@ def read_rpc_file(path: str) -> dict[str, Any] | None:
     values = re.split(r"[\s,;]+", text.strip(" \t\r\n,;"))
     if re.fullmatch(r"[-+.\deE]+", "".join(values)) and len(values) in (90, 92):
         text = "\n".join(f"{name}: {value}" for name, value in zip(_SINGLE + _LISTS, values[-90:], strict=True))
-    if re.search(r"^\s*lineNumCoef\s*=", text, re.IGNORECASE | re.MULTILINE):
-        return _read_by_gdal(text, ".RPB")
-    text = re.sub(r"[ \t]*[:=][ \t]*", ": ", text)  # GDAL reads no spaces before the colon
-    has_names = re.search(r"^\s*LINE_NUM_COEFF_20:", text, re.IGNORECASE | re.MULTILINE)
-    return _read_by_gdal(text, "_RPC.TXT") if has_names else None
-
-
-def _read_by_gdal(text: str, end: str) -> dict[str, Any]:
-    """Return what GDAL reads from a text whose file has a name with this end, beside an image."""
+    end = ".RPB" if re.search(r"^\s*lineNumCoef\s*=", text, re.IGNORECASE | re.MULTILINE) else "_RPC.TXT"
+    if end == "_RPC.TXT":
+        text = re.sub(r"[ \t]*[:=][ \t]*", ": ", text)  # GDAL reads no spaces before the colon
+        if not re.search(r"^\s*LINE_NUM_COEFF_20:", text, re.IGNORECASE | re.MULTILINE):
+            return None
     with TemporaryDirectory() as folder:
         image = Path(folder) / "image.tif"
         image.with_name(f"image{end}").write_bytes(text.encode("latin-1"))

@@ -1,6 +1,5 @@
 """Read rasters on the grid of a surface model."""
 
-import logging
 from math import ceil, floor
 from pathlib import Path
 
@@ -22,8 +21,6 @@ from sat_intervals.raster.images import opened
 from sat_intervals.tiling import Window
 
 Bounds = tuple[float, float, float, float]
-
-_LOG = logging.getLogger(__name__)
 
 
 def is_surface(path: Path) -> bool:
@@ -142,7 +139,11 @@ def ground_of(path: Path, bounds: Bounds, around: float) -> tuple[np.ndarray, Ge
     near = _cells(place, (west - around, south - around, east + around, north + around)).grown(2, 2).clipped(whole)
     heights, given = np.full((rows, columns), np.nan), {"src_crs": place.crs, "src_nodata": np.nan}
     wanted = {"dst_crs": degrees, "dst_transform": grid.transform, "resampling": Resampling.bilinear}
-    reproject(_known(path, near), heights, src_transform=place.shifted(near).transform, **given, **wanted)
+    with opened(str(path), near) as dataset:
+        area = RasterioWindow(near.column, near.row, near.width, near.height)
+        known = dataset.read(1, window=area) * dataset.scales[0] + dataset.offsets[0]
+        known[(dataset.read_masks(1, window=area) == 0) | ~is_ground(known)] = np.nan
+    reproject(known, heights, src_transform=place.shifted(near).transform, **given, **wanted)
     margin = floor(around / cell)
     outside = np.ones(heights.shape, bool)
     outside[margin : rows - margin, margin : columns - margin] = False
@@ -160,19 +161,3 @@ def _cells(place: Georeferencing, bounds: Bounds) -> Window:
     left, bottom, right, top = transform_bounds("EPSG:4326", place.crs, *bounds)
     rows, columns = sorted(((bottom - f) / e, (top - f) / e)), sorted(((left - c) / a, (right - c) / a))
     return Window.around(*zip(rows, columns, strict=True))
-
-
-def _known(path: Path, window: Window) -> np.ndarray:
-    """Read heights of a window of a raster, NaN where they are unknown; warn of those that no ground has."""
-    with opened(str(path), window) as dataset:
-        area = RasterioWindow(window.column, window.row, window.width, window.height)
-        pixels = np.where(dataset.read_masks(1, window=area) == 0, np.nan, dataset.read(1, window=area))
-        heights = pixels * dataset.scales[0] + dataset.offsets[0]
-    wild = pixels[np.isfinite(heights) & ~is_ground(heights)]
-    if wild.size:
-        _LOG.warning(
-            "%s: %.1f %% of its heights near the images are left out, such as %.9g, which no ground has: declare it as "
-            "no data: rio edit-info --nodata %.9g %s",
-            *(path, 100 * wild.size / pixels.size, wild[0], wild[0], path),
-        )
-    return np.where(is_ground(heights), heights, np.nan)

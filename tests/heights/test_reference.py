@@ -23,7 +23,7 @@ with suppress(SatIntervalsError):  # without shareloc all tests here are skipped
     from sat_intervals.heights.reference import Reference, make_truth
 
 pytestmark = [
-    pytest.mark.peer("shareloc"),
+    pytest.mark.peer("shareloc", "pyarrow"),
     pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning"),  # as epipolar images are
 ]
 
@@ -371,7 +371,11 @@ def test_reference_command__what_it_cannot_use_gets_one_line(relief, tmp_path):
         (["--points", town, "--ellipsoid"], files, "give a reference of the same place"),
         (["--points", town, "--ellipsoid", "--no-register"], files, "no pixel of"),
         (["--points", few, "--ellipsoid"], files, "has fewer than 30 heights where"),
-        (["--points", broken, "--ellipsoid"], files, "broken.csv, line 2: 'north' is not a number"),
+        (
+            ["--points", broken, "--ellipsoid"],
+            files,
+            "broken.csv cannot be read as points: In CSV column #2: Row #2: CSV conversion",
+        ),
         (
             ["--points", nameless, "--ellipsoid"],
             files,
