@@ -1,6 +1,5 @@
 """Evaluate a surface model: the options of ``sat-intervals evaluate --dsm``, and what they print and write."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,13 +38,13 @@ class Details:
         from sat_intervals.cli.tables import surface_markdown
         from sat_intervals.evaluate.comparison import open_comparison
         from sat_intervals.evaluate.dsm import read_profile
-        from sat_intervals.raster.publishing import write_file
+        from sat_intervals.raster.publishing import write_file, write_record
         from sat_intervals.show.accuracy import draw_error_map, draw_height_profile, draw_reliability
 
         figures, table, reliability, errors, heights = paths = [folder / name for name in _FILES]
         compared = open_comparison(surface.dsm, surface.reference, report["registration"])
         profile = read_profile(compared, self.line)
-        write_file(figures, json.dumps({"software": "sat-intervals"} | report, indent=1).encode())
+        write_record(figures, {"software": "sat-intervals"} | report)
         write_file(table, f"<!-- sat-intervals -->\n{surface_markdown(str(surface.dsm), report)}".encode())
         draw_reliability(report, reliability, surface.dsm.name)
         draw_error_map(compared, report["all"]["nmad"], errors)

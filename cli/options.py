@@ -1,7 +1,5 @@
 """Options shared by commands, and checks of file names."""
 
-import json
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import wraps
@@ -174,15 +172,9 @@ def _check_options(has_surface: bool, others: str, of_surfaces: Sequence[str]) -
 
 def say_json(content: Any) -> None:
     """Print figures as JSON; NaN and infinity are null."""
+    from sat_intervals.raster import as_json
 
-    def plain(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {str(key): plain(one) for key, one in value.items()}
-        if isinstance(value, (list, tuple)):
-            return [plain(one) for one in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    click.echo(json.dumps(plain(content), indent=1, default=str))
+    click.echo(as_json(content))
 
 
 def log_options(command: Command) -> Command:

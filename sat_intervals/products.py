@@ -1,8 +1,11 @@
 """Define the data dictionary: bands, validity flags and the states of an input pixel."""
 
-from collections.abc import Collection
+import json
+import math
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from os import PathLike, fspath
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -169,3 +172,21 @@ SURFACE = (
     Band("confidence", "", "mean of their confidences, 0 to 1, high = easy to match"),
     Band("agreement", "", "1 where the intervals of several pairs meet, 0 where they do not; no data for one pair"),
 )
+
+
+def plain(content: Any) -> Any:
+    """Return a record as JSON gives it back: numbers are Python's, NaN and infinity are None."""
+    if isinstance(content, Mapping):
+        return {str(key): plain(value) for key, value in content.items()}
+    if isinstance(content, (list, tuple)):
+        return [plain(value) for value in content]
+    if isinstance(content, np.generic):
+        content = content.item()
+    if isinstance(content, float) and not math.isfinite(content):
+        return None
+    return fspath(content) if isinstance(content, PathLike) else content
+
+
+def as_json(content: Any, *, indent: int | None = 1) -> str:
+    """Return a record as JSON; every record that is written goes through here."""
+    return json.dumps(plain(content), indent=indent)

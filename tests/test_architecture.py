@@ -109,6 +109,20 @@ def test_homes__a_library_is_imported_in_its_home_only() -> None:
     assert sorted((a, library) for a, library in libraries if HOMES.get(library, a) != a) == []
 
 
+def test_homes__records_are_written_in_one_place() -> None:
+    """Elsewhere numbers of NumPy would end a command after all its work."""
+    dumping = {module for module, file in modules().items() if "json.dumps(" in file.read_text()}
+    ours = {name.removeprefix("sat_intervals.") for name in dumping}
+    assert ours == {
+        "products",
+        "store.manifest",
+        "config.calibration",
+        "config.sections",
+        "config.wording",
+        "show.report.page",
+    }
+
+
 def test_limits__functions_parameters_and_modules_stay_small() -> None:
     over = {}
     for module, file in modules().items():

@@ -12,8 +12,8 @@ from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.heights.lattice import Lattice
 from sat_intervals.heights.rectified import rectified_files
 from sat_intervals.progress import Progress
-from sat_intervals.raster import write_file
 from sat_intervals.raster.identity import identity
+from sat_intervals.raster.publishing import write_record
 from sat_intervals.results import Run, open_run
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def set_geometry(
     _, report = _sensors(run, paths)
     known = {kind: identity(str(path)) for kind, path in zip(_KINDS, paths, strict=True)}
     record = {"software": "sat-intervals", "images": _images(run)} | known
-    write_file(run.out / FILE, json.dumps(record, indent=1).encode())
+    write_record(run.out / FILE, record)
     return report
 
 

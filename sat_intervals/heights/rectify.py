@@ -1,6 +1,5 @@
 """Make an epipolar pair of two raw images, with its grids and a record of how it was made: ``rectify.json``."""
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -12,11 +11,11 @@ import numpy as np
 
 from sat_intervals.errors import ChangedInputError, SatIntervalsError
 from sat_intervals.heights.rectified import FILE, GRIDS, IMAGES, read_record, rectified_files
-from sat_intervals.products import Band
+from sat_intervals.products import Band, plain
 from sat_intervals.progress import Progress
 from sat_intervals.raster import File, Georeferencing, Image, OutputWriter, check_not_replaced, describe
 from sat_intervals.raster.identity import identity
-from sat_intervals.raster.publishing import check_free, write_file
+from sat_intervals.raster.publishing import check_free, write_record
 from sat_intervals.results import paths_of
 from sat_intervals.store.lock import locked
 from sat_intervals.store.manifest import differences
@@ -108,7 +107,7 @@ def _make(
 
 
 def _note(out: Path, record: dict[str, Any]) -> None:
-    write_file(out / FILE, (json.dumps(record, indent=1) + "\n").encode())
+    write_record(out / FILE, record)
 
 
 def _asked(pair: RawPair, left: "SensorImage", right: "SensorImage", known: dict[str, Any]) -> dict[str, Any]:
@@ -125,7 +124,7 @@ def _asked(pair: RawPair, left: "SensorImage", right: "SensorImage", known: dict
     inputs |= {name: identity(str(file), files) for name, file in given if file}
     settings = {"altitude": terrain.altitude, "resolution_of": pair.resolution_of}
     asked = {"software": f"sat-intervals {version('sat-intervals')}", "inputs": inputs, "settings": settings}
-    content: dict[str, Any] = json.loads(json.dumps(asked))
+    content: dict[str, Any] = plain(asked)
     return content
 
 

@@ -1,7 +1,6 @@
 """Describe a finished run as a STAC item, for catalogues of images."""
 
 import hashlib
-import json
 import math
 import os
 from collections.abc import Iterator
@@ -14,7 +13,8 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import FLAGS, SURFACE, Band, interval_bands
-from sat_intervals.raster import footprint, read_layers, read_place, read_tags, write_file
+from sat_intervals.raster import footprint, read_layers, read_place, read_tags
+from sat_intervals.raster.publishing import write_record
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import strips
 
@@ -41,7 +41,7 @@ def write_item(out: str | Path, *, taken: str | None = None, identifier: str | N
     file = run.out / "stac.json"
     run.check_kept([file])
     item = _item(run, _times(run, taken), identifier or run.out.resolve().name)
-    write_file(file, (json.dumps(item, indent=1, allow_nan=False) + "\n").encode())
+    write_record(file, item)
     return file
 
 

@@ -1,6 +1,5 @@
 """Matching of two arrays in memory as one tile, without files, store or scheduler."""
 
-import json
 import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
@@ -21,6 +20,7 @@ from sat_intervals.match.rows import Survey
 from sat_intervals.match.sampling import look, spots
 from sat_intervals.match.search_range import Found, NoRangeError, find_range, finest_step, reduced, with_range
 from sat_intervals.match.whole import cut, match_whole, whole_view
+from sat_intervals.products import as_json
 from sat_intervals.tiling import Window
 
 _LOG = logging.getLogger(__name__)
@@ -115,7 +115,7 @@ def _matched(left: Array, right: Array, config: Config, given: np.ndarray | None
     if given is not None:
         final = with_agreement(final, given)
     attributes = {"preset": config.preset} if config.preset else {}
-    return labelled(final, labels, attributes | ({"rows": json.dumps(asdict(rows))} if rows else {}))
+    return labelled(final, labels, attributes | ({"rows": as_json(asdict(rows), indent=None)} if rows else {}))
 
 
 def _searched(

@@ -1,6 +1,5 @@
 """How far the rows of two images differ: a smooth function of the place, fitted to looks at blocks of the pair."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -10,6 +9,7 @@ import numpy as np
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.rows import RowOffsets
 from sat_intervals.match.sampling import Look, noise_of
+from sat_intervals.products import plain
 from sat_intervals.tiling import Window
 
 # Looks that a constant and a plane need, and each further degree per coefficient.
@@ -121,7 +121,7 @@ class Survey:
 
     def report(self) -> dict[str, Any]:
         """Return the mapping that the store and run.json hold."""
-        report: dict[str, Any] = json.loads(json.dumps(asdict(self)))  # lists, as a file gives them back
+        report: dict[str, Any] = plain(asdict(self))  # lists, as a file gives them back
         return report
 
     @classmethod

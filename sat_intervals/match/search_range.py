@@ -286,7 +286,7 @@ def _matches_of(left: np.ndarray, right: np.ndarray, search: np.ndarray | None, 
             first, last = most
         elif search is not None and (low or high):
             more = max(4, (last - first) // 2)
-            first, last = max(most[0], first - low * more), min(most[1], last + high * more)
+            first, last = max(most[0], first - more * bool(low)), min(most[1], last + more * bool(high))
         else:
             break
     return found

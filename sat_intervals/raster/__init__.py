@@ -1,5 +1,6 @@
 """Read and write GeoTIFF: images, their georeferencing, and the files of a run. Only this folder imports rasterio."""
 
+from sat_intervals.products import as_json
 from sat_intervals.raster.blocks import BLOCK, codec_versions, compressed, factors, halved
 from sat_intervals.raster.cog import Part
 from sat_intervals.raster.files import RUN_FILES, File, points_file, ranges_file, run_files, surface_file, truth_file
@@ -36,7 +37,7 @@ from sat_intervals.raster.writer import OutputWriter
 
 __all__ = [
     "BLOCK", "GROUND", "RUN_FILES", "ControlPoint", "File", "Frame", "Georeferencing", "HeightRaster", "Image", "Layer",
-    "OutputError", "OutputWriter", "Part", "Projection", "Vertical", "between_180", "check_free", "check_not_replaced",
+    "OutputError", "OutputWriter", "Part", "Projection", "Vertical", "as_json", "between_180", "check_free", "check_not_replaced",
     "check_pair", "check_reference", "check_space", "codec_versions", "compressed", "covered_window", "describe",
     "factors", "file_bytes", "files_of", "find_model", "footprint", "geoid_grid", "grid_mapping", "ground_of", "halved",
     "horizontal_name", "is_ground", "is_surface", "new_file", "north_up", "open_image", "part_bytes", "points_file",

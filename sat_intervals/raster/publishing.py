@@ -8,10 +8,12 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from io import BufferedWriter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.products import as_json
 from sat_intervals.raster import gdal
 from sat_intervals.raster.files import File
 
@@ -51,6 +53,11 @@ def write_file(path: str | os.PathLike[str], content: bytes) -> None:
     """Write a small file with `new_file`."""
     with new_file(path) as temporary:
         temporary.write_bytes(content)
+
+
+def write_record(path: str | os.PathLike[str], content: Any) -> None:
+    """Write a record with `new_file`, as JSON."""
+    write_file(path, f"{as_json(content)}\n".encode())
 
 
 @dataclass

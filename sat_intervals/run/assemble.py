@@ -1,7 +1,6 @@
 """Put the files of a run together from finished parts, compare its inputs, and publish."""
 
 import filecmp
-import json
 import logging
 import os
 from collections.abc import Iterable, Iterator, Mapping
@@ -14,6 +13,7 @@ import numpy as np
 
 from sat_intervals.errors import REPORT, ChangedInputError, RunError, SatIntervalsError
 from sat_intervals.match.postprocess import ConfidenceScale, confidence_scale
+from sat_intervals.products import as_json
 from sat_intervals.progress import Progress, logged_stage
 from sat_intervals.raster import OutputError, OutputWriter, Part
 from sat_intervals.raster.publishing import new_file
@@ -70,7 +70,7 @@ def _publish(job: Job, writer: OutputWriter, made: Mapping[str, Path], report: d
         if not job.overwrite and there.exists() and not filecmp.cmp(there, new, shallow=False):
             raise SatIntervalsError(f"{there} is not of this run: move it away or give --overwrite; the tiles are kept")
     with new_file(job.out / RUN_REPORT) as new:  # gets its name last
-        new.write_bytes((json.dumps(report, indent=1) + "\n").encode())
+        new.write_bytes((as_json(report) + "\n").encode())
         (job.out / RUN_REPORT).unlink(missing_ok=True)  # never beside files of another run
         writer.publish()
 

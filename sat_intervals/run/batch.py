@@ -1,6 +1,5 @@
 """Match many pairs on one cluster, with tiles of several pairs in flight and a folder for each pair."""
 
-import json
 import logging
 import resource
 import threading
@@ -20,7 +19,7 @@ from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, OutputError, files_of, open_image
 from sat_intervals.raster.identity import check_not_replaced
-from sat_intervals.raster.publishing import write_file
+from sat_intervals.raster.publishing import write_record
 from sat_intervals.run.assemble import end_tiles
 from sat_intervals.run.connection import Connection
 from sat_intervals.run.job import Job, prepare
@@ -124,7 +123,7 @@ class _Report:
             _LOG.info("pair %s: %s", name, how.get("error", how["state"]))
         self.states.update(states)
         try:
-            write_file(self._file, (json.dumps(self.states, indent=1) + "\n").encode())
+            write_record(self._file, self.states)
         except OutputError as error:
             raise RunError(f"{error}, and rerun the batch: it resumes") from error
 

@@ -1,6 +1,5 @@
 """The inputs of a run: described at the start, at a resume, and once before publication."""
 
-import json
 from collections.abc import Iterator, Mapping
 from importlib.metadata import version
 from typing import Any
@@ -8,6 +7,7 @@ from typing import Any
 from sat_intervals.config import Config, Mccnn
 from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import ChangedInputError, RunError
+from sat_intervals.products import plain
 from sat_intervals.raster import Image, describe, open_image
 from sat_intervals.raster.identity import identity
 from sat_intervals.store.manifest import differences
@@ -38,7 +38,7 @@ def _files_of(described: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
 def check_unchanged(before: Mapping[str, Any], left: Image, right: Image, config: Config) -> None:
     """Raise ChangedInputError if inputs differ from their description of before; all local files are read."""
     try:
-        now = json.loads(json.dumps(describe_inputs(left, right, config, {})))
+        now = plain(describe_inputs(left, right, config, {}))
     except (OSError, ChangedInputError) as error:
         raise RunError(f"an input cannot be compared now: {error}; rerun the same command: it resumes") from error
     changes = list(differences(before, now))

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from sat_intervals.config import Config
 from sat_intervals.errors import ChangedInputError, SatIntervalsError
+from sat_intervals.products import plain
 from sat_intervals.raster import RUN_FILES, File, run_files
 from sat_intervals.store.manifest import MANIFEST, StoreError, differences, read_manifest
 from sat_intervals.store.tiles import home_of
@@ -72,7 +73,7 @@ def next_step(
         if overwrite:
             return "start anew"
         raise
-    changes = list(differences(there, json.loads(json.dumps(manifest)))) if there else []
+    changes = list(differences(there, plain(manifest))) if there else []
     if overwrite:
         return "start anew" if changes else "resume" if there else "start"
     if changes:
@@ -95,5 +96,5 @@ def _other_run(report: Mapping[str, Any], manifest: Mapping[str, Any], settings:
     kept = {name: report["settings"].get(name) for name in settings}
     before = {"settings": kept, "inputs": report["inputs"], "region": report["tiles"].get("region")}
     now = {"settings": settings, "inputs": manifest["inputs"], "region": manifest["region"]}
-    changes = list(differences(before, json.loads(json.dumps(now))))
+    changes = list(differences(before, plain(now)))
     return f"another run: {'; '.join(changes)}" if changes else "a run of other local ranges or of another version"

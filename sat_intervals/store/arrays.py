@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from sat_intervals.products import as_json
 from sat_intervals.store.folder import Folder
 
 META = "meta"
@@ -84,7 +85,8 @@ def packed(arrays: Iterable[tuple[str, np.ndarray]], meta: Mapping[str, Any]) ->
                 np.lib.format.write_array_header_1_0(member, np.lib.format.header_data_from_array_1_0(array))
                 member.write(array.reshape(-1).view(np.uint8).data)
             del array
-        archive.writestr(zipfile.ZipInfo(META), json.dumps({**meta, "names": names}))  # completed by ``arrays``
+        record = as_json({**meta, "names": names}, indent=None)  # completed by ``arrays``
+        archive.writestr(zipfile.ZipInfo(META), record)
     return stream.getbuffer()
 
 

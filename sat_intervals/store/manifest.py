@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.products import as_json
 from sat_intervals.store.folder import Folder, folder_at
 from sat_intervals.tiling import Grid, Window
 
@@ -40,7 +41,7 @@ def read_manifest(home: Path) -> dict[str, Any] | None:
 
 def write_manifest(home: Path, manifest: Mapping[str, Any]) -> None:
     """Write the manifest of a run."""
-    folder_at(home).write(MANIFEST, json.dumps(manifest, indent=1).encode(), is_flushed=True)
+    folder_at(home).write(MANIFEST, as_json(manifest).encode(), is_flushed=True)
 
 
 def grid_of(manifest: Mapping[str, Any]) -> Grid:
@@ -59,7 +60,7 @@ def digest(content: Any) -> str:
     def kept(there: dict[str, Any]) -> dict[str, Any]:
         return {key: value for key, value in there.items() if key not in (_IGNORED, PLACE)}
 
-    same = json.dumps(json.loads(json.dumps(content), object_hook=kept), sort_keys=True)
+    same = json.dumps(json.loads(as_json(content), object_hook=kept), sort_keys=True)
     return hashlib.sha256(same.encode()).hexdigest()[:32]
 
 
@@ -77,5 +78,5 @@ def differences(there: Any, wanted: Any, path: str = "") -> Iterator[str]:
 
 def _short(value: Any) -> str:
     """Return a value as JSON, cut where a line would get too long, as of a whole calibration."""
-    text = json.dumps(value)
+    text = as_json(value, indent=None)
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
