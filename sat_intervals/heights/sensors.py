@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -152,6 +152,7 @@ def check_cover(sensors: Sensors, region: Window, right_width: int, minimum: int
 
 def median_residual(sensors: Sensors, region: Window, minimum: int, maximum: int) -> float:
     """Return the median residual at some positions across a region; raise if the models do not fit."""
+    sensors = replace(sensors, rows=None)  # rows that were moved tell how models differ from the ground, not from grids
     rows = np.linspace(region.row, region.row_stop - 1, _CHECKED)
     columns = np.linspace(region.column, region.column_stop - 1, _CHECKED)
     places = np.meshgrid(rows, columns, [minimum, maximum], indexing="ij")
