@@ -11,8 +11,8 @@ from sat_intervals.results import Results
 from sat_intervals.show.canvas import DPI, INK, Frame, MapLayer, draw_layer, page
 from sat_intervals.show.legend import BLUE, SKY
 
-# Pixels of offset at the ends of the colours of row offsets, at least.
-_LEAST = 0.5
+# Pixels of offset at the ends of the colours of row offsets, at least, and places within them: wrong ones lie beyond.
+_LEAST, _SHOWN = 0.5, 0.8
 
 
 def has_range(results: Results) -> bool:
@@ -77,8 +77,8 @@ def draw_rows(results: Results, target: Path, dpi: int = DPI) -> None:
     with page(target, (9.2, 4.2), dpi, title) as figure:
         panels = figure.subplots(1, 2)
         for panel, values, name in zip(panels, (before, after), ("Row offset, px", "What is left, px"), strict=True):
-            most = max(_LEAST, float(np.abs(values).max()))
+            most = max(_LEAST, float(np.quantile(np.abs(values), _SHOWN)))
             dots = panel.scatter(column, row, c=values, s=150, cmap="RdBu", vmin=-most, vmax=most, edgecolors="0.4")
             panel.set(title=name, xlim=(0, results.right.width), ylim=(results.right.height, 0), aspect="equal")
             panel.set(xlabel="column", ylabel="row")
-            figure.colorbar(dots, ax=panel)
+            figure.colorbar(dots, ax=panel, extend="both" if np.abs(values).max() > most else "neither")

@@ -39,6 +39,7 @@ from sat_intervals.show.dsm import _relief, draw_surface
 from sat_intervals.show.legend import ORANGE, PIXEL_CLASSES, SKY, VERMILION, class_counts, classify
 from sat_intervals.show.maps import draw_errors, draw_overview
 from sat_intervals.show.profile import draw_curve, draw_profile
+from sat_intervals.show.search_range import draw_rows
 from sat_intervals.tiling import Window
 
 WHITE, GREY = (255, 255, 255), (222, 222, 222)
@@ -376,6 +377,21 @@ def test_draw_curve__without_sgm_interval_and_truth(tmp_path):
 def test_draw_curve__of_a_pixel_without_candidate_says_why(run, tmp_path):
     with pytest.raises(SatIntervalsError, match=r"row 0, column 0 has no cost curve: .*border.*: choose a pixel"):
         draw_curve(open_results(run), tmp_path / "curve.png", 0, 0)
+
+
+def test_draw_rows__colours_are_those_of_most_places(tmp_path, monkeypatch):
+    random, limits = np.random.default_rng(0), []
+    offsets = np.append(random.normal(1.2, 0.1, 20), [15.1, -14.7])
+    places = np.stack([random.uniform(0, 60, 22), random.uniform(0, 80, 22), offsets, offsets - 1.2], axis=1)
+    out = write_run(tmp_path, *random_bands(60, 80))
+    rows = {"before": [1.2, 1.4], "after": [0.1, 13.0], "looks": places.tolist()}
+    results = open_results(out)
+    results.report["survey"] = {"rows": rows}
+    scatter = Axes.scatter
+    monkeypatch.setattr(Axes, "scatter", lambda *all_, **how: limits.append(how["vmax"]) or scatter(*all_, **how))
+    draw_rows(results, tmp_path / "rows.png")
+    assert limits[0] == pytest.approx(1.3, abs=0.15)
+    assert limits[1] == 0.5
 
 
 def test_classify__takes_the_first_reason():
