@@ -124,8 +124,7 @@ def _asked(pair: RawPair, left: "SensorImage", right: "SensorImage", known: dict
     inputs |= {name: identity(str(file), files) for name, file in given if file}
     settings = {"altitude": terrain.altitude, "resolution_of": pair.resolution_of}
     asked = {"software": f"sat-intervals {version('sat-intervals')}", "inputs": inputs, "settings": settings}
-    content: dict[str, Any] = plain(asked)
-    return content
+    return dict(plain(asked))
 
 
 def _is_needed(out: Path, asked: dict[str, Any], before: dict[str, Any], *, overwrite: bool) -> bool:

@@ -100,12 +100,13 @@ def _matched(left: Array, right: Array, config: Config, given: np.ndarray | None
     _check_rows(*pixels)
     if config.disparity.grid or config.disparity.around:
         raise SatIntervalsError("a raster needs files: use match_pair, or disparity local, or intervals_around")
+    is_given = not config.disparity.is_auto
     config, ranges = _searched(*pixels, config, given)
     _check_fit(*pixels, config)
     images = _image(pixels[0]), _image(pixels[1])
     rows = None
     if config.rows == "auto":
-        right_image, rows = _with_rows(*images, config)
+        right_image, rows = _with_rows(*images, config, is_given=is_given)
         images = images[0], right_image
     statistics = None
     if config.cost.needs_statistics:
@@ -172,12 +173,13 @@ def _found(left: np.ma.MaskedArray, right: np.ma.MaskedArray) -> Found:
 
 
 def _with_rows(
-    left: np.ma.MaskedArray, right: np.ma.MaskedArray, config: Config
+    left: np.ma.MaskedArray, right: np.ma.MaskedArray, config: Config, *, is_given: bool
 ) -> tuple[np.ma.MaskedArray, RowOffsets | None]:
     """Return the right image at the rows of the left one, itself if they correspond, and the offsets taken out."""
     views, search = (whole_view(left), whole_view(right)), (config.disparity.minimum, config.disparity.maximum)
     found = (look(spot, *map(cut, views, spot.views)) for spot in spots(views[0].window, *search))
-    rows = Survey.of_looks(views[0].window, search, [one for one in found if one], right.shape).taken(config.rows)
+    survey = Survey.of_looks(views[0].window, search, [one for one in found if one], right.shape)
+    rows = survey.taken(config.rows, survey.missed(lambda: _found(left, right)) if is_given else "")
     if rows is None:
         return right, None
     first, count, *places = rows.read(0, 0, *right.shape)

@@ -1,6 +1,7 @@
 """How far the rows of two images differ: a smooth function of the place, fitted to looks at blocks of the pair."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.rows import RowOffsets
 from sat_intervals.match.sampling import Look, noise_of
+from sat_intervals.match.search_range import Found, NoRangeError
 from sat_intervals.products import plain
 from sat_intervals.tiling import Window
 
@@ -22,28 +24,21 @@ _STEPS, _SCALE = 30, 0.05
 _TAKEN, _MOST = 0.3, 12.0
 # Pixels from the middle of a look to the rim of its block.
 _HALF = 128
-# Pixels of residual that a smooth function should not leave in a quarter of the looks, or in half of them.
-_JITTER, _CONTRADICTING = 0.3, 0.5
+# Share of matches of a look that sees the same ground in both images: in others up to .6 match by chance.
+_MATCHED = 0.62
+# Pixels of residual in a quarter of the looks from which on they have jitter, and are no epipolar pair; and in half of
+# them above which no polynomial holds, so that a constant is taken.
+_JITTER, _CONTRADICTING, _HOLDING = 0.3, 4.0, 0.5
 
 
 @dataclass(frozen=True)
 class RowFit:
-    """The row offsets of a pair with their evidence.
+    """The row offsets of a pair with their evidence, in pixels.
 
-    Attributes
-    ----------
-    offsets
-        The function.
-    matches
-        Number of matches that were measured.
-    most
-        Largest offset in the region, in pixels.
-    before, after
-        Median and 90 % quantile of the sizes of offsets of the looks, and of what the function leaves of them, each
-        fitted to the other half of the looks, in pixels.
-    looks
-        Row, column of the right image, offset, and what the function, fitted to the other half, leaves of it, in
-        pixels, of each look.
+    offsets, matches, most: the function, how many matches were measured, and its largest value in the region.
+    before, after: median and 90 % quantile of the sizes of offsets of the looks, and of what is left of them.
+    looks: row, column of the right image, offset, and what the function, fitted to the other half, leaves of it.
+    share: of the looks that were measured, those that match; without any the others are here, to judge the pair.
     """
 
     offsets: RowOffsets
@@ -52,32 +47,39 @@ class RowFit:
     before: tuple[float, float]
     after: tuple[float, float]
     looks: tuple[tuple[float, float, float, float], ...]
+    share: float
 
     @property
     def has_jitter(self) -> bool:
         """Return whether offsets are not smooth: detector joins, or oscillations of the satellite."""
-        return bool(np.quantile([abs(look[3]) for look in self.looks], 0.75) > _JITTER)
+        return self.share > 0 and self._scatter > _JITTER
+
+    @property
+    def _scatter(self) -> float:
+        return float(np.quantile([abs(look[3]) for look in self.looks], 0.75))
+
+    @property
+    def farthest(self) -> float:
+        """Return the largest offset that was measured, in pixels."""
+        return max(abs(look[2]) for look in self.looks)
+
+    @property
+    def kind(self) -> str:
+        """Return what was fitted, in words."""
+        return "a smooth function" if len(self.offsets.coefficients) > 1 else "a constant"
 
     @property
     def contradiction(self) -> str | None:
-        """Return why the pair is not epipolar: offsets are larger than is searched, or contradict each other."""
-        before, after = self.before[0], self.after[0]
-        if before <= _MOST and self.most <= 2 * _MOST and after <= _CONTRADICTING:
+        """Return why the pair is not epipolar, and the way out: offsets are large, or contradict each other."""
+        if self.before[0] <= _MOST and self.most <= 2 * _MOST and self._scatter <= _CONTRADICTING:
             return None
+        lower = np.median([look[2] for look in self.looks])
         return (
-            f"not an epipolar pair: rows differ by {before:.1f} px in the median, up to {self.most:.1f} px, and by "
-            f"{after:.1f} px from a smooth function, over {self.matches} matches; {_MOST:g} px are searched"
+            f"not an epipolar pair: rows differ by {self.before[0]:.1f} px in the median, at most {self.farthest:.1f}, "
+            f"and by {self.after[0]:.1f} px from {self.kind}, over {self.matches} matches; {_MOST:g} px are searched: "
+            f"check that both images show the same place, crop or shift the right image, which lies {lower:.0f} rows "
+            "lower, resample the pair, or give --rows none"
         )
-
-    @property
-    def way_out(self) -> str:
-        """Return what to do about a `contradiction`."""
-        if self.after[0] > _CONTRADICTING:
-            return (
-                "leave out the search range if it is given, check that both images show the same place, resample the "
-                "pair, or give --rows none"
-            )
-        return f"crop or shift the right image, which lies {np.median([look[2] for look in self.looks]):.0f} rows lower"
 
     @classmethod
     def of_report(cls, report: Mapping[str, Any]) -> "RowFit":
@@ -109,20 +111,29 @@ class Survey:
     @property
     def is_large(self) -> bool:
         """Return whether row offsets are large enough to be taken out: below that, resampling costs more."""
-        return self.rows is not None and self.rows.most >= _TAKEN
+        return self.rows is not None and self.rows.share > 0 and self.rows.most >= _TAKEN
 
-    def taken(self, rows: str) -> RowOffsets | None:
+    def missed(self, find: Callable[[], Found]) -> str:
+        """Return a line if few blocks match, since the range that was given misses most of the matches to find."""
+        with suppress(NoRangeError):
+            if self.rows and self.rows.share < 0.5 and (share := (found := find()).share(*self.search)) < 0.5:
+                return (
+                    f"disparities {self.search[0]} to {self.search[1]} are searched, but have {100 * share:.0f} % of "
+                    f"the matches, which are at {found.minimum} to {found.maximum}: give those, or leave out the range"
+                )
+        return ""
+
+    def taken(self, rows: str, missed: str = "") -> RowOffsets | None:
         """Return the row offsets to take out by the setting ``rows``; raise if the pair is not epipolar."""
         if rows == "none" or self.rows is None:
             return None
-        if line := self.rows.contradiction:
-            raise SatIntervalsError(f"{line}: {self.rows.way_out}")
+        if line := missed or self.rows.contradiction:
+            raise SatIntervalsError(line)
         return self.rows.offsets if self.is_large else None
 
     def report(self) -> dict[str, Any]:
         """Return the mapping that the store and run.json hold."""
-        report: dict[str, Any] = plain(asdict(self))  # lists, as a file gives them back
-        return report
+        return dict(plain(asdict(self)))  # lists, as a file gives them back
 
     @classmethod
     def of_report(cls, report: Mapping[str, Any]) -> "Survey":
@@ -135,8 +146,10 @@ def fit_rows(looks: Sequence[Look], rows: int, columns: int) -> RowFit | None:
     """Fit the row offsets of looks at a pair; ``rows`` and ``columns`` are those of the right image.
 
     Of polynomials the one of the lowest degree is taken unless a higher one leaves clearly less in looks that it was
-    not fitted to. None with fewer than three looks.
+    not fitted to; a constant where none holds. None with fewer than three looks.
     """
+    matching = [look for look in looks if look.share >= _MATCHED]
+    share, looks = len(matching) / max(1, len(looks)), matching or looks
     if len(looks) < _FEWEST:
         return None
     row, column, offset = np.array([(look.row, look.column, look.rows) for look in looks]).T
@@ -147,6 +160,7 @@ def fit_rows(looks: Sequence[Look], rows: int, columns: int) -> RowFit | None:
     for count in counts[1:]:
         if np.median(np.abs(left[count])) < _BETTER * np.median(np.abs(left[best])):
             best = count
+    best = best if np.median(np.abs(left[best])) <= _HOLDING else 1
     found = _fit(nothing.design(row, column, best), offset)
     offsets = RowOffsets(tuple(round(float(value), 6) for value in found), rows, columns)
     # the looks are the middles of blocks
@@ -164,6 +178,7 @@ def fit_rows(looks: Sequence[Look], rows: int, columns: int) -> RowFit | None:
         (_rounded(before, 0.5), _rounded(before, 0.9)),
         (_rounded(after, 0.5), _rounded(after, 0.9)),
         tuple(map(tuple, places.tolist())),
+        round(share, 3),
     )
 
 

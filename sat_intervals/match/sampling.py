@@ -52,7 +52,7 @@ class Look(NamedTuple):
     """Figures of a block.
 
     row, column: middle of the part that was matched, row of the left and column of the right image.
-    number: matches there.
+    number, share: matches there, and their share of its pixels.
     matched, random: mean distances of their codes, and of those of random candidates.
     rows: median of the rows by which the right image lies lower, in pixels.
     """
@@ -60,6 +60,7 @@ class Look(NamedTuple):
     row: float
     column: float
     number: int
+    share: float
     matched: float
     random: float
     rows: float
@@ -193,7 +194,7 @@ def _fine(left: View, right: View, minimum: int) -> tuple[Look, float] | None:
     column = np.arange(index.shape[1])
     random = _distances(*codes, (index + _AWAY + column) % codes[1].state.shape[1] - column, 0)[where].mean()
     middle = float(np.median(disparity[known])) + minimum
-    return Look(0.0, middle, int(known.sum()), float(matched), float(random), 0.0), shift
+    return Look(0.0, middle, int(known.sum()), float(known.mean()), float(matched), float(random), 0.0), shift
 
 
 def _shifts(equations: np.ndarray, pixels: np.ndarray) -> np.ndarray:

@@ -92,14 +92,23 @@ class Found:
         return LocalRanges.of_report(self.cells)
 
     def fitted(self, columns: int) -> "Found":
-        """Return the range cut at both ends to as many disparities as the right image has columns."""
+        """Return the range cut to as many disparities as the right image has columns, where it has most matches."""
         if max(-self.minimum, self.maximum) > MOST_PIXELS:
             raise NoRangeError(
                 f"disparities of {self.minimum} to {self.maximum} px, beyond {MOST_PIXELS}: crop or shift the images "
                 "so that they are near 0"
             )
         beyond = max(0, self.maximum - self.minimum + 1 - columns)
-        return replace(self, minimum=self.minimum + beyond // 2, maximum=self.maximum - (beyond - beyond // 2))
+        starts = self.minimum + np.arange(beyond + 1)
+        shares = self.share(starts, starts + (self.maximum - self.minimum - beyond)).round(2)
+        best = starts[shares == shares.max()]
+        first = int(best[(len(best) - 1) // 2])
+        return replace(self, minimum=first, maximum=first + self.maximum - self.minimum - beyond)
+
+    def share(self, first: Any, last: Any) -> np.ndarray:
+        """Return the share of the matches between disparities."""
+        below, edges = np.cumsum([0, *self.histogram["counts"]]), self.histogram["edges"]
+        return np.asarray((np.interp(last, edges, below) - np.interp(first, edges, below)) / below[-1])
 
     def report(self) -> dict[str, Any]:
         """Return the mapping that the store and run.json hold."""

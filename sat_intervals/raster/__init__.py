@@ -13,15 +13,7 @@ from sat_intervals.raster.images import Image, check_pair, describe, open_image
 from sat_intervals.raster.layers import north_up, read_known, read_layers, read_shape, read_tags, write_layer
 from sat_intervals.raster.projection import Projection, geoid_grid, grid_mapping, utm_of
 from sat_intervals.raster.published import tags_beside
-from sat_intervals.raster.publishing import (
-    OutputError,
-    check_free,
-    check_space,
-    file_bytes,
-    new_file,
-    part_bytes,
-    write_file,
-)
+from sat_intervals.raster.publishing import OutputError, check_free, check_space, file_bytes, new_file, part_bytes
 from sat_intervals.raster.rpc import find_model, read_rpc_file
 from sat_intervals.raster.surfaces import (
     check_reference,
@@ -37,11 +29,12 @@ from sat_intervals.raster.writer import OutputWriter
 
 __all__ = [
     "BLOCK", "GROUND", "RUN_FILES", "ControlPoint", "File", "Frame", "Georeferencing", "HeightRaster", "Image", "Layer",
-    "OutputError", "OutputWriter", "Part", "Projection", "Vertical", "as_json", "between_180", "check_free", "check_not_replaced",
-    "check_pair", "check_reference", "check_space", "codec_versions", "compressed", "covered_window", "describe",
-    "factors", "file_bytes", "files_of", "find_model", "footprint", "geoid_grid", "grid_mapping", "ground_of", "halved",
-    "horizontal_name", "is_ground", "is_surface", "new_file", "north_up", "open_image", "part_bytes", "points_file",
-    "ranges_file", "read_heights", "read_known", "read_layers", "read_place", "read_rpc_file", "read_shape",
-    "read_small_image", "read_small_layers", "read_tags", "read_views", "read_window", "resolution_of", "run_files",
-    "surface_file", "tags_beside", "truth_file", "utm_of", "warn_of_no_data", "write_file", "write_layer",
+    "OutputError", "OutputWriter", "Part", "Projection", "Vertical", "as_json", "between_180", "check_free",
+    "check_not_replaced", "check_pair", "check_reference", "check_space", "codec_versions", "compressed",
+    "covered_window", "describe", "factors", "file_bytes", "files_of", "find_model", "footprint", "geoid_grid",
+    "grid_mapping", "ground_of", "halved", "horizontal_name", "is_ground", "is_surface", "new_file", "north_up", "open_image",
+    "part_bytes", "points_file", "ranges_file", "read_heights", "read_known", "read_layers", "read_place",
+    "read_rpc_file", "read_shape", "read_small_image", "read_small_layers", "read_tags", "read_views", "read_window",
+    "resolution_of", "run_files", "surface_file", "tags_beside", "truth_file", "utm_of", "warn_of_no_data",
+    "write_layer",
 ]  # fmt: skip

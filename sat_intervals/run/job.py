@@ -62,7 +62,7 @@ class Job:
     ``requested`` is the section ``disparity`` as given, ``found`` the result of the search for a range, ``local`` the
     local ranges, which workers read from the store. With ``overwrite``, files and another run in ``out`` may be
     replaced. `calibrate` makes no files of its tiles: ``has_files`` is False. ``volume_of`` makes the volumes of
-    another matcher; its name is in the settings.
+    another matcher; its name is in the settings. ``missed``: see `Survey.missed`.
     """
 
     left: Image
@@ -76,6 +76,7 @@ class Job:
     survey: Survey | None = None
     ranges_digest: str | None = None
     local: LocalRanges | None = None
+    missed: str = ""
     overwrite: bool = False
     has_files: bool = True
     volume_of: VolumeOf | None = None
@@ -233,7 +234,8 @@ def prepare(
     config = fitted_to_jobs(config)
     check_tiles(config, region)
     survey = _survey(known, find, left, right, config, region)
-    right = replace(right, rows=_rows_taken(survey, config, left, right))
+    missed = survey.missed(lambda: _found({}, find, *images)) if survey and find and not (found or window) else ""
+    right = replace(right, rows=_rows_taken(survey, config, left, right, missed))
     read = [*identities(inputs), *(files_of(config.disparity.grid) if config.disparity.grid else ())]
     ranges = digest(local.report()) if local else None
     run = digest(_manifest(config, inputs, region, ranges, right.rows))
@@ -241,7 +243,7 @@ def prepare(
     folder = folder_at(f"{folder_at(store)}/{'-'.join(filter(None, (pair, run)))}" if store else home_of(out))
     kept = Store(folder, Grid(region, config.tiles.size), run)
     check_not_replaced(read, [out / name for name in OUTPUTS], [home_of(out)])
-    return Job(left, right, config, kept, out, inputs, requested, found, survey, ranges, local, overwrite)
+    return Job(left, right, config, kept, out, inputs, requested, found, survey, ranges, local, missed, overwrite)
 
 
 def _known(out: Path, before: Mapping[str, Any], inputs: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -273,9 +275,9 @@ def _survey(
     return find.survey(left, right, region, search) if find else None
 
 
-def _rows_taken(survey: Survey | None, config: Config, left: Image, right: Image) -> RowOffsets | None:
+def _rows_taken(survey: Survey | None, config: Config, left: Image, right: Image, missed: str) -> RowOffsets | None:
     try:
-        return survey.taken(config.rows) if survey else None
+        return survey.taken(config.rows, missed) if survey else None
     except SatIntervalsError as error:
         raise SatIntervalsError(f"{left.path} and {right.path}: {error}") from None
 

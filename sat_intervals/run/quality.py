@@ -120,11 +120,12 @@ def warnings_of(job: Job, counts: Mapping[str, Any], quality: Mapping[str, Any])
             f"{config.disparity.around}: {of_given['outside']} of {sum(of_given.values())} disparities are outside the "
             "intervals: check that x_right = x_left + disparity, and that it is of the left image"
         )
-    if of_data or (found and found.contradiction):
+    if job.missed:
+        of_pair = [f"{paths[0]} and {paths[1]}: {job.missed}"]
+    elif of_data or (found and found.contradiction):
         of_pair = rows
     else:  # where a given range is wrong, rows are, too
-        lost = _rejected(counts, paths, was_found=was_found)
-        of_pair = lost or ([] if was_found else of_range) or [*rows, *of_range]
+        of_pair = _rejected(counts, paths) or ([] if was_found else of_range) or [*rows, *of_range]
     noise = noise_line(job.survey, paths) if config.cost.method == "census" and config.preset == "paper" else []
     missed = unreached(config)
     return [*of_data, *of_pair, *noise, *([f"{paths[0]}: {missed}"] if missed else [])]
@@ -141,15 +142,14 @@ def _spoiled(job: Job, counts: Mapping[str, Any], no_data: float) -> list[str]:
     ]
 
 
-def _rejected(counts: Mapping[str, Any], paths: tuple[str, str], *, was_found: bool) -> list[str]:
+def _rejected(counts: Mapping[str, Any], paths: tuple[str, str]) -> list[str]:
     """Return a warning if cross-checking rejects more than it keeps."""
     rejected = counts["causes"]["occlusion"] + counts["causes"]["mismatch"]
     if rejected <= counts["valid"]:
         return []
-    share, range_too = rejected / (rejected + counts["valid"]), "" if was_found else ", and leave out the search range"
     return [
-        f"{paths[0]} and {paths[1]}: cross-checking rejected {100 * share:.0f} % of the matches: check that both "
-        f"images show the same place{range_too}"
+        f"{paths[0]} and {paths[1]}: cross-checking rejected {100 * rejected / (rejected + counts['valid']):.0f} % of "
+        "the matches: check that both images show the same place, and the search range"
     ]
 
 
@@ -220,12 +220,12 @@ def rows_left(survey: Survey | None, rows: str, path: str) -> list[str]:
         return []
     found = survey.rows
     if found.contradiction:
-        return [f"{path}: {found.contradiction}: {found.way_out}"]
+        return [f"{path}: {found.contradiction}"]
     if rows == "none" and survey.is_large and found.before[0] > _ROW_OFFSET:
         return [f"{path}: rows differ by {found.before[0]:.1f} px in the median: match with --rows auto"]
     if found.has_jitter:
         return [
-            f"{path}: a smooth function leaves {found.after[0]:.2f} px of row offset in the median, "
+            f"{path}: {found.kind} leaves {found.after[0]:.2f} px of row offset in the median, "
             f"{found.after[1]:.2f} px in 90 % of the places: jitter or joins of detectors, or too little texture"
         ]
     return []

@@ -31,7 +31,7 @@ def compared_rows(left: Path, right: Path, progress: Progress) -> dict[str, Any]
         left_over = (rows.after if is_taken else rows.before)[0]
         verdict = f"correspond within {_AGREE:g} px" if left_over <= _AGREE else f"differ by {left_over:.2f} px"
         text = (
-            f"offsets of {rows.before[0]:.2f} px in the median, up to {rows.most:.2f} px; {does}; a smooth function "
+            f"offsets of {rows.before[0]:.2f} px in the median, up to {rows.farthest:.2f} px; {does}; {rows.kind} "
             f"leaves {rows.after[0]:.2f} px on other matches: rows {verdict}"
         )
     warnings = rows_left(survey, "auto", str(right))

@@ -21,8 +21,8 @@ from sat_intervals.raster import (
     read_place,
     read_small_image,
     read_small_layers,
-    write_file,
 )
+from sat_intervals.raster.publishing import write_file
 from sat_intervals.results import Run, open_input, open_run
 from sat_intervals.show import styles
 from sat_intervals.tiling import Window

@@ -1,6 +1,7 @@
 """Row offsets fitted to looks at blocks of a pair."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from sat_intervals import SatIntervalsError
 from sat_intervals.match.rows import Survey, fit_rows
 from sat_intervals.match.sampling import Look
+from sat_intervals.run.quality import rows_left
 from sat_intervals.tiling import Window
 
 
@@ -17,7 +19,7 @@ def looks_at(function, count=25, side=1000, wrong=0, noise=0.0, seed=0):
     row, column = np.mgrid[0 : side - 1 : 5j, 0 : side - 1 : 5j].reshape(2, -1)[:, :count]
     offset = function(row, column) + noise * random.normal(size=row.size)
     offset[random.permutation(row.size)[:wrong]] += 3
-    return [Look(r, c, 1000, 5.0, 12.0, float(rows)) for r, c, rows in zip(row, column, offset, strict=True)]
+    return [Look(r, c, 1000, 0.8, 5.0, 12.0, float(rows)) for r, c, rows in zip(row, column, offset, strict=True)]
 
 
 def test_fit_rows__finds_a_plane_beside_wrong_looks():
@@ -48,6 +50,34 @@ def test_survey__refuses_pairs_that_are_not_epipolar():
         with pytest.raises(SatIntervalsError, match=r"not an epipolar pair: rows differ by .* px in the median"):
             survey.taken("auto")
         assert survey.taken("none") is None
+
+
+@pytest.mark.parametrize("noise", [0.8, 1.3, 1.8])
+def test_fit_rows__blocks_that_scatter_get_a_constant_and_a_warning(noise):
+    for seed in range(8):
+        survey = survey_of(looks_at(lambda r, c: -1.4 + 0 * r, wrong=2, noise=noise, seed=seed))
+        (constant,) = survey.taken("auto").coefficients
+        assert abs(constant + 1.4) < 0.6 * noise
+        (line,) = rows_left(survey, "auto", "right.tif")
+        assert f"a constant leaves {survey.rows.after[0]:.2f} px of row offset in the median" in line
+
+
+def test_fit_rows__looks_that_hardly_match_are_not_taken_out():
+    looks = looks_at(lambda r, c: 0.9 + 0 * r, noise=0.02)
+    poor = [look._replace(share=0.58, rows=look.rows + 9 * (-1) ** place) for place, look in enumerate(looks[5:])]
+    assert fit_rows([*looks[:5], *poor], 1000, 1000).offsets.coefficients[0] == pytest.approx(0.9, abs=0.03)
+    assert fit_rows([*looks[:2], *poor], 1000, 1000) is None
+    alone = survey_of([look._replace(share=0.5) for look in looks])
+    assert alone.rows.before[0] == pytest.approx(0.9, abs=0.03)
+    assert alone.taken("auto") is None
+
+
+def test_contradiction__names_no_median_above_the_maximum():
+    values = [8.1, 8.2, -8.0, -8.3, 0.1, 8.4, -8.2, 8.0]
+    looks = [look._replace(rows=rows) for look, rows in zip(looks_at(lambda r, c: 0 * r), values, strict=False)]
+    line = fit_rows(looks, 1000, 1000).contradiction
+    median, most = map(float, re.search(r"differ by (\S+) px in the median, at most (\S+),", line).groups())
+    assert (median, most) == (8.2, 8.4)
 
 
 def survey_of(looks):

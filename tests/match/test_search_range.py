@@ -94,6 +94,19 @@ def test_fitted__has_no_more_disparities_than_the_right_image_has_columns(scene)
     assert (cut.minimum, cut.maximum) == (found.minimum + 1, found.maximum - 2)
 
 
+@pytest.mark.parametrize("seed", [0, 3])
+def test_find_range__of_a_pair_that_shares_little_keeps_the_end_with_the_matches(seed):
+    """15 % overlap: disparities near -530, and stray matches near 300, together beyond the columns of the image."""
+    wide = make_scene(300, 1187, seed=seed)
+    left, right = wide.left[:, :620], wide.right[:, 527:1147]
+    truth = wide.truth[:, 527:620] - 527
+    found = searched(left, right).fitted(620)
+    assert found.maximum - found.minimum < 620
+    assert np.nanmean((found.minimum <= truth) & (truth <= found.maximum)) > 0.99
+    matched = match_arrays(left, right, {"disparity": {"minimum": found.minimum, "maximum": found.minimum + 90}})
+    assert "rows" not in matched.attrs
+
+
 def test_found__survives_its_report(scene):
     found = searched(scene.left, scene.right)
     assert Found.of_report(found.report()) == found
@@ -110,5 +123,6 @@ def test_match_arrays__finds_the_range_that_is_not_given(scene):
 def test_fitted__refuses_a_range_that_no_settings_hold(ends):
     with pytest.raises(NoRangeError, match="beyond 16000: crop or shift the images"):
         Found(*ends, matched=0.5, levels=()).fitted(40_000)
-    kept = with_range(load_config(), Found(-16_000, -15_900, 0.5, ()).fitted(40_000))
+    found = Found(-16_000, -15_900, 0.5, (), {"edges": [-15_990, -15_910], "counts": [9]})
+    kept = with_range(load_config(), found.fitted(40_000))
     assert load_config(kept.model_dump()).disparity.minimum == -16_000

@@ -7,7 +7,8 @@ import sys
 import pytest
 from helpers import contents
 
-from sat_intervals.raster import OutputError, check_free, check_space, new_file, write_file
+from sat_intervals.raster import OutputError, check_free, check_space, new_file
+from sat_intervals.raster.publishing import write_file
 
 
 def test_new_file__is_not_there_before_it_is_whole(tmp_path):

@@ -1,13 +1,14 @@
 """What is odd about a pair: each cause is named once, the likeliest first."""
 
 import json
+import re
 
 import numpy as np
 import pytest
 import rasterio
 from helpers import PLACE, invoke, write_pair
 
-from sat_intervals import SatIntervalsError, load_config, match_pair
+from sat_intervals import SatIntervalsError, load_config, match_arrays, match_pair
 from sat_intervals.demo import make_scene
 from sat_intervals.raster import open_image, write_layer
 from sat_intervals.run.quality import doubts_of_images, verdict_of
@@ -100,13 +101,23 @@ def test_warnings_of__isolated_pixels_without_data(scene, tmp_path):
 
 
 @pytest.mark.parametrize("search", [(-180, -110), (90, 150), (-120, -60), (40, 80)])
-def test_match__a_range_beside_the_truth_is_refused_or_the_one_diagnosis(tmp_path, search):
-    write_pair(tmp_path, make_scene(300, 460, seed=4))
+def test_match__a_range_beside_the_truth_is_the_one_diagnosis(tmp_path, search):
+    """Rows are wrong, too, but the range is named, and the one to give."""
+    scene = make_scene(300, 460, seed=4)
+    write_pair(tmp_path, scene)
     images = tmp_path / "left.tif", tmp_path / "right.tif"
-    result = invoke("match", *images, tmp_path / "out", "--disparity", *search, "--quiet")
-    (line,) = result.stderr.splitlines()
-    assert "leave out the search range" in line or line.endswith("or leave it out")
-    assert result.exit_code == (2 if "not an epipolar pair" in line else 0)
+    for rows, status in (("auto", 2), ("none", 0)):
+        out = tmp_path / rows
+        result = invoke("match", *images, out, "--disparity", *search, "--rows", rows, "--quiet")
+        (line,) = result.stderr.splitlines()
+        assert result.exit_code == status
+        searched = f"disparities {search[0]} to {search[1]} are searched, but have 0 % of the matches, which are at "
+        there = re.search(searched + r"(\S+) to (\S+): give those, or leave out the range", line)
+        assert int(there[1]) <= scene.minimum
+        assert int(there[2]) >= scene.maximum
+    left, right = (np.ma.masked_equal(image, 0) for image in (scene.left, scene.right))
+    with pytest.raises(SatIntervalsError, match=f"which are at {there[1]} to {there[2]}: give those, or leave"):
+        match_arrays(left, right, {"disparity": {"minimum": search[0], "maximum": search[1]}})
 
 
 def test_prepare__refuses_an_unrelated_image(tmp_path):
