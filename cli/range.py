@@ -27,13 +27,16 @@ def search_range(pair: PairArguments, output: Path | None, overwrite: bool, as_j
     that of the whole images.
     """
     from sat_intervals.cli.console import Console
+    from sat_intervals.config import load_config
+    from sat_intervals.prepare.local import write_ranges
+    from sat_intervals.prepare.pair import FilePair
+    from sat_intervals.prepare.prepared import prepare
+    from sat_intervals.prepare.search_range import collar_lines
     from sat_intervals.raster import files_of
     from sat_intervals.raster.identity import check_not_replaced
     from sat_intervals.raster.publishing import check_free
-    from sat_intervals.run.local_ranges import write_ranges
-    from sat_intervals.run.quality import collar_lines, rows_left
-    from sat_intervals.run.search_range import finder_here
-    from sat_intervals.tiling import Window
+    from sat_intervals.run.each import each_here
+    from sat_intervals.run.quality import rows_left
 
     with Console(quiet or as_json) as console:
         left, right = pair.open()
@@ -41,10 +44,11 @@ def search_range(pair: PairArguments, output: Path | None, overwrite: bool, as_j
             names = pair.files
             check_not_replaced([file for name in names for file in (name, *files_of(name))], [output])
             check_free(output, overwrite=overwrite)
-        with finder_here(console.progress) as finder:
-            found = finder.search_range(left, right)
-            whole = Window(0, 0, left.height, left.width)
-            survey = finder.survey(left, right, whole, (found.minimum, found.maximum))
+        with each_here(console.progress) as each:
+            prepared = prepare(FilePair(left, right), load_config({"rows": "none"}), each)
+        found, survey = prepared.search, prepared.survey
+        assert found  # nothing was given
+        assert survey
         if output:
             write_ranges(output, found.local, left)
     if as_json:

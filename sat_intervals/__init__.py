@@ -17,8 +17,8 @@ if typing.TYPE_CHECKING:
     from sat_intervals.heights.triangulate import triangulate
     from sat_intervals.interop.dataset import decode_flags, open
     from sat_intervals.match.calibrate_volumes import calibrate_volumes
-    from sat_intervals.match.in_memory import intervals_around, match_arrays
     from sat_intervals.match.volumes import intervals_of
+    from sat_intervals.prepare.in_memory import intervals_around, match_arrays
     from sat_intervals.raster import open_image
     from sat_intervals.run.pair import match_pair
     from sat_intervals.tiling import Window
@@ -56,11 +56,11 @@ _HOMES = {
     "calibrate_volumes": "match.calibrate_volumes",
     "decode_flags": "interop.dataset",
     "evaluate_run": "evaluate.disparity",
-    "intervals_around": "match.in_memory",
+    "intervals_around": "prepare.in_memory",
     "intervals_of": "match.volumes",
     "load_config": "config",
     "make_surface": "heights.dsm",
-    "match_arrays": "match.in_memory",
+    "match_arrays": "prepare.in_memory",
     "match_pair": "run.pair",
     "open": "interop.dataset",
     "open_image": "raster",

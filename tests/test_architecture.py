@@ -13,13 +13,13 @@ FLOORS = [
     {"cli"},
     {"show"},
     {"evaluate", "heights", "run", "interop"},
-    {"results"},
+    {"results", "prepare"},
     {"match", "raster"},
     {"kernels", "config", "store"},
     {"products", "tiling", "machine", "progress", "demo", "errors", "configs"},
 ]
 FLOOR_OF = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
-MOST_ENTRIES, MOST_ARROWS = 18, 81
+MOST_ENTRIES, MOST_ARROWS = 19, 90
 
 # The only room that may import a library.
 HOMES = {
@@ -116,6 +116,7 @@ def test_homes__records_are_written_in_one_place() -> None:
     assert ours == {
         "products",
         "store.manifest",
+        "heights.point_files",
         "config.calibration",
         "config.sections",
         "config.wording",

@@ -93,7 +93,7 @@ class SatIntervals(PandoraMethod, short_name=["sat_intervals"]):  # type: ignore
         used_band: str = "b0",
     ) -> xr.Dataset:
         """Match a tile by CARS' interface: all pixels over one range, cropped around zero if CARS limits memory."""
-        from sat_intervals.match.in_memory import match_arrays  # `import cars` must not load numba
+        from sat_intervals.prepare.in_memory import match_arrays  # `import cars` must not load numba
 
         grids = dense_matching_algo.compute_disparity_grid(
             disp_range_grid.data, left_image_object, right_image_object, used_band, False

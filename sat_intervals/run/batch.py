@@ -22,16 +22,15 @@ from sat_intervals.raster.identity import check_not_replaced
 from sat_intervals.raster.publishing import write_record
 from sat_intervals.run.assemble import end_tiles
 from sat_intervals.run.connection import Connection
-from sat_intervals.run.job import Job, prepare
+from sat_intervals.run.each import EachOnWorkers
+from sat_intervals.run.job import Job, open_job
 from sat_intervals.run.pair import (
     Matched,
     check_failures,
     complete_before,
     match_and_assemble,
     match_jobs,
-    measure_images,
 )
-from sat_intervals.run.search_range import Finder
 from sat_intervals.run.state import OUTPUTS
 from sat_intervals.run.status import read_report
 from sat_intervals.run.workers import Workers
@@ -82,7 +81,7 @@ def match_batch(
         report = _Report(out)
         report.note({pair.name: {"state": "waiting"} for pair in pairs})
         with Connection(common.cluster, out) as connection:
-            find = Finder(connection, progress)
+            each = EachOnWorkers(connection, progress)
             jobs: dict[str, Job] = {}
             begun: dict[str, PairOfBatch] = {}
             for number, given in enumerate(pairs):
@@ -91,7 +90,7 @@ def match_batch(
                     pair = begun[given.name] = steps.begin(given)
                     own = merged(overrides or {}, pair.settings)
                     settings = load_config(sections, own, preset_wins=True, file=file)
-                    job = _prepared(pair, out, settings, overwrite=overwrite, find=find)
+                    job = _prepared(pair, out, settings, overwrite=overwrite, each=each)
                     stack.enter_context(locked(job.out))
                     if job.begin():
                         jobs[pair.name] = job
@@ -145,7 +144,7 @@ def _files(name: str) -> list[str]:
     return [name]
 
 
-def _prepared(pair: PairOfBatch, out: Path, settings: Config, *, overwrite: bool, find: Finder) -> Job:
+def _prepared(pair: PairOfBatch, out: Path, settings: Config, *, overwrite: bool, each: EachOnWorkers) -> Job:
     def opened(side: str, path: str, mask: str | None) -> Image:
         options: dict[str, Any] = {
             name: pair.reading.get(f"{side}_{name}", pair.reading.get(name)) for name in ("band", "nodata")
@@ -154,8 +153,8 @@ def _prepared(pair: PairOfBatch, out: Path, settings: Config, *, overwrite: bool
 
     left, right = opened("left", pair.left, pair.left_mask), opened("right", pair.right, pair.right_mask)
     window = Window(*pair.window) if pair.window else None
-    return prepare(
-        left, right, out / pair.name, settings, window=window, overwrite=overwrite, pair=pair.name, find=find
+    return open_job(
+        left, right, out / pair.name, settings, window=window, overwrite=overwrite, pair=pair.name, each=each
     )
 
 
@@ -195,16 +194,9 @@ def _matched(
         compile_kernels(job.config)
     assembling: dict[Future[dict[str, Any]], str] = {}
     with _thread() as (thread, check):
-        measured = {}
-        for name, job in jobs.items():
-            try:
-                measure_images(workers, job, progress)
-                measured[name] = job
-            except Exception as error:  # one pair's failure must not stop the others
-                yield name, _failed(error)
-        names = {id(job): name for name, job in measured.items()}
+        names = {id(job): name for name, job in jobs.items()}
         assembled = partial(_assembled, workers, check, keep_tiles=keep_tiles)
-        for matched in match_jobs(workers, list(measured.values()), progress):
+        for matched in match_jobs(workers, list(jobs.values()), progress):
             assembling[thread.submit(assembled, matched)] = names[id(matched.job)]
             for future in [future for future in assembling if future.done()]:
                 yield assembling.pop(future), future.result()

@@ -6,18 +6,16 @@ from dataclasses import asdict, dataclass, replace
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-from sat_intervals.config import Config, Volume, load_config, resolved
-from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.config import Config, load_config, resolved
+from sat_intervals.errors import RunError
 from sat_intervals.kernels import FINGERPRINT
-from sat_intervals.kernels.rows import RowOffsets
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.matching_cost import VolumeOf
-from sat_intervals.match.normalization import PairStatistics
-from sat_intervals.match.rows import Survey
 from sat_intervals.match.schedule import blocks_of, handed_bytes
-from sat_intervals.match.search_range import Found
+from sat_intervals.prepare.pair import Each, FilePair, here
+from sat_intervals.prepare.prepared import Prepared, prepare
 from sat_intervals.raster import (
     Image,
     check_space,
@@ -28,7 +26,6 @@ from sat_intervals.raster import (
 from sat_intervals.raster.identity import check_not_replaced
 from sat_intervals.run.checks import check_tiles, checked_pair, checked_region, fitted_to_jobs
 from sat_intervals.run.inputs import describe_inputs, identities
-from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.state import OUTPUTS, check_folder, files_of_run, next_step, read_report
 from sat_intervals.run.workers import is_remote
 from sat_intervals.store.folder import folder_at
@@ -36,21 +33,10 @@ from sat_intervals.store.manifest import MANIFEST, PLACE, StoreError, digest, pl
 from sat_intervals.store.tiles import LAYOUT, ONCE, PARTS, TILES, DamagedTilesError, Store, home_of, store_bytes
 from sat_intervals.tiling import Grid, Tile, Window
 
-
-class Finds(Protocol):
-    """Finds what a pair needs before its tiles."""
-
-    def search_range(self, left: Image, right: Image) -> Found:
-        """Find the search range."""
-
-    def survey(self, left: Image, right: Image, region: Window, search: tuple[int, int]) -> Survey:
-        """Look at blocks of a region over a search range."""
-
-
 # Settings without effect on tiles; those of the preset itself are listed one by one.
 _NOT_OF_TILES = {"preset", "rows", "median", "regularization", "products", "cluster"}
-# Files of `ONCE`.
-_STATISTICS, _RANGE = "statistics", "range"
+# File of `ONCE`.
+_RANGE = "range"
 _REMOTE = "check URL and credentials, and pip install the package of its file system ('sat-intervals[remote]' for S3)"
 _NO_TILES = Grid(Window(0, 0, 0, 0), 1)
 
@@ -59,33 +45,40 @@ _NO_TILES = Grid(Window(0, 0, 0, 0), 1)
 class Job:
     """All that is needed to match any tile of a pair and to assemble its files; picklable.
 
-    ``requested`` is the section ``disparity`` as given, ``found`` the result of the search for a range, ``local`` the
-    local ranges, which workers read from the store. With ``overwrite``, files and another run in ``out`` may be
-    replaced. `calibrate` makes no files of its tiles: ``has_files`` is False. ``volume_of`` makes the volumes of
-    another matcher; its name is in the settings. ``missed``: see `Survey.missed`.
+    ``prepared`` is what was found of the pair; workers read the local ranges from the store. ``manifest`` is all that
+    decides the bytes of a tile, and where the tiles are. ``requested`` is the section ``disparity`` as given. With
+    ``overwrite``, files and another run in ``out`` may be replaced. `calibrate` makes no files of its tiles:
+    ``has_files`` is False. ``volume_of`` makes the volumes of another matcher; its name is in the settings.
     """
 
-    left: Image
-    right: Image
-    config: Config
+    prepared: Prepared[FilePair]
     store: Store
     out: Path
-    inputs: dict[str, Any]
+    manifest: dict[str, Any]
     requested: dict[str, Any]
-    found: Found | None = None
-    survey: Survey | None = None
-    ranges_digest: str | None = None
-    local: LocalRanges | None = None
-    missed: str = ""
     overwrite: bool = False
     has_files: bool = True
     volume_of: VolumeOf | None = None
 
     @property
-    def manifest(self) -> dict[str, Any]:
-        """Return all that decides the bytes of a tile, and where the tiles are."""
-        made = _manifest(self.config, self.inputs, self.store.grid.region, self.ranges_digest, self.right.rows)
-        return made | {PLACE: None if self.is_home else str(self.store.folder)}
+    def left(self) -> Image:
+        """Return the left image."""
+        return self.prepared.pair.left
+
+    @property
+    def right(self) -> Image:
+        """Return the right image, with the row offsets that are taken out of it."""
+        return self.prepared.pair.right
+
+    @property
+    def config(self) -> Config:
+        """Return the settings, with the search range as numbers."""
+        return self.prepared.config
+
+    @property
+    def inputs(self) -> dict[str, Any]:
+        """Return the inputs as `describe_inputs` does."""
+        return dict(self.manifest["inputs"])
 
     @property
     def is_home(self) -> bool:
@@ -123,10 +116,8 @@ class Job:
             self.store.write(ONCE, "begun")  # fails at once where nothing can be written
             if step != "resume":
                 write_manifest(home_of(self.out), self.manifest)
-            if self.found or self.local or self.survey:
-                found, ranges = self.found and self.found.report(), self.local and self.local.report()
-                of, survey = origin_of(self.inputs), self.survey and self.survey.report()
-                self.store.write(ONCE, _RANGE, of=of, found=found, ranges=ranges, survey=survey)
+            ranges = self.prepared.ranges and self.prepared.ranges.report()
+            self.store.write(ONCE, _RANGE, of=origin_of(self.inputs), ranges=ranges, **self.prepared.known())
         except OSError as error:
             way_out = "make room, check its rights or choose another folder" if self.store.folder.is_local else _REMOTE
             raise StoreError(f"{self.store.folder} cannot be used: {error.strerror or error}: {way_out}") from error
@@ -153,45 +144,26 @@ class Job:
 
     def check_version(self) -> None:
         """Raise if this process, a worker, would write other bytes than the command."""
-        if self.store.run != digest(self.manifest):
+        if any(self.manifest[name] != value for name, value in _made_by().items()):
             raise RunError("this worker has another version of sat-intervals: install the same for all")
         wanted = self.inputs.get("weights", {}).get("onnxruntime")
         if wanted and (here := version("onnxruntime")) != wanted:
             raise RunError(f"onnxruntime is {here} here, but the run has {wanted}: install the same for all workers")
 
-    def write_statistics(self, statistics: PairStatistics) -> None:
-        """Keep mean and standard deviation of both images for all tiles."""
-        self.store.write(ONCE, _STATISTICS, **statistics.report())
-
-    def has_statistics(self) -> bool:
-        """Return whether the statistics of `write_statistics` are there, or the run needs none."""
-        return not self.config.cost.needs_statistics or self.store.meta(ONCE, _STATISTICS) is not None
-
-    def statistics(self) -> PairStatistics | None:
-        """Return mean and standard deviation of both images, None if the run needs none."""
-        if not self.config.cost.needs_statistics:
-            return None
-        kept = self.store.meta(ONCE, _STATISTICS)
-        if kept is None:
-            raise DamagedTilesError(
-                f"the image statistics in {self.store.folder} are missing: rerun the same command: it resumes"
-            )
-        return PairStatistics.of_report({side: kept[side] for side in ("left", "right")})
-
     def ranges(self) -> LocalRanges | None:
         """Return the local search ranges, None without them."""
-        if not self.config.disparity.is_local or self.local is not None:
-            return self.local
-        kept = self.store.meta(ONCE, _RANGE, origin_of(self.inputs)) or {}
-        if kept.get("ranges") is None or digest(kept["ranges"]) != self.ranges_digest:
+        if self.prepared.ranges or "local_ranges" not in self.manifest:
+            return self.prepared.ranges
+        kept = (self.store.meta(ONCE, _RANGE, origin_of(self.inputs)) or {}).get("ranges")
+        if kept is None or digest(kept) != self.manifest["local_ranges"]:
             raise DamagedTilesError(
                 f"the local search ranges in {self.store.folder} are missing: rerun the same command: it resumes"
             )
-        return LocalRanges.of_report(kept["ranges"])
+        return LocalRanges.of_report(kept)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out what workers read from the store, see `ranges`."""
-        return self.__dict__ | {"local": None, "survey": None}
+        """Leave out what workers read from the store, see `ranges`, and evidence."""
+        return self.__dict__ | {"prepared": replace(self.prepared, ranges=None, search=None, survey=None)}
 
     def waiting(self) -> list[Tile]:
         """Return the tiles that are not done."""
@@ -199,7 +171,7 @@ class Job:
         return [tile for tile in self.store.grid if tile.name not in done]
 
 
-def prepare(
+def open_job(
     left: str | Path | Image,
     right: str | Path | Image,
     out: str | Path,
@@ -208,78 +180,58 @@ def prepare(
     window: Window | None = None,
     overwrite: bool = False,
     pair: str = "",
-    find: Finds | None = None,
+    each: Each | None = None,
 ) -> Job:
-    """Check all that can be checked before tiles are matched; ``find`` finds what no earlier run has found.
-
-    Without ``find`` rows are not looked at.
-    """
+    """Check all that can be checked before tiles are matched, and prepare the pair; without ``each`` as given."""
     config, out = resolved(load_config(config)), Path(out)
-    if isinstance(config.cost, Volume) and config.cost.name is None:
-        raise SatIntervalsError("cost.method volume needs the function that makes volumes: give match_pair volume_of")
     requested = config.disparity.model_dump(mode="json")
-    left, right = checked_pair(left, right, config)
-    images = left, right
-    region = checked_region(left, window)
+    images = checked_pair(left, right, config)
+    region = checked_region(images[0], window)
     if not config.disparity.is_auto:
         check_tiles(fitted_to_jobs(config), region)
     check_folder(out, overwrite=overwrite)
     before: dict[str, Any] = {}  # manifest or report of an earlier run
     with suppress(StoreError):
         before = read_manifest(home_of(out)) or read_report(out) or {}
-    inputs = describe_inputs(left, right, config, identities(before.get("inputs", {})))
+    inputs = describe_inputs(*images, config, identities(before.get("inputs", {})))
     known = _known(out, before, inputs)
-    config, found, local = searched(config, left, lambda: _found(known, find, *images))
-    checked_pair(left, right, config)
-    config = fitted_to_jobs(config)
+    prepared = prepare(FilePair(*images), config, each or here, region=window, known=known, looks=each is not None)
+    return job_of(prepared, out, inputs, requested, region, overwrite=overwrite, pair=pair)
+
+
+def job_of(
+    prepared: Prepared[FilePair],
+    out: Path,
+    inputs: dict[str, Any],
+    requested: dict[str, Any],
+    region: Window,
+    *,
+    overwrite: bool = False,
+    pair: str = "",
+) -> Job:
+    """Make the job of a prepared pair in a folder; its tiles are named by ``pair`` where several share a store."""
+    config = fitted_to_jobs(prepared.config)
     check_tiles(config, region)
-    survey = _survey(known, find, left, right, config, region)
-    missed = survey.missed(lambda: _found({}, find, *images)) if survey and find and not (found or window) else ""
-    right = replace(right, rows=_rows_taken(survey, config, left, right, missed))
+    prepared = replace(prepared, config=config)
     read = [*identities(inputs), *(files_of(config.disparity.grid) if config.disparity.grid else ())]
-    ranges = digest(local.report()) if local else None
-    run = digest(_manifest(config, inputs, region, ranges, right.rows))
-    store = config.cluster.store
+    manifest = _manifest(prepared, inputs, region)
+    run, store, home = digest(manifest), config.cluster.store, folder_at(home_of(out))
     folder = folder_at(f"{folder_at(store)}/{'-'.join(filter(None, (pair, run)))}" if store else home_of(out))
-    kept = Store(folder, Grid(region, config.tiles.size), run)
+    manifest[PLACE] = None if folder == home else str(folder)
     check_not_replaced(read, [out / name for name in OUTPUTS], [home_of(out)])
-    return Job(left, right, config, kept, out, inputs, requested, found, survey, ranges, local, missed, overwrite)
+    kept = Store(folder, Grid(region, config.tiles.size), run)
+    return Job(prepared, kept, out, manifest, requested, overwrite)
 
 
 def _known(out: Path, before: Mapping[str, Any], inputs: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return what an earlier run of the same images has found: ``found`` and ``survey``."""
+    """Return what an earlier run of the same images has found, see `Prepared.known`."""
     if PLACE in before:
         store = Store(place_of(home_of(out), before), _NO_TILES, "")
         return store.meta(ONCE, _RANGE, origin_of(inputs)) or {}
     if before.get("origin") == origin_of(inputs):
-        return {"found": before["search"], "survey": before["survey"]}
+        statistics = before["normalization"] and {"rows": before["rows"], **before["normalization"]}
+        return {"found": before["search"], "survey": before["survey"], "statistics": statistics}
     return {}
-
-
-def _found(known: Mapping[str, Any], find: Finds | None, left: Image, right: Image) -> Found:
-    if known.get("found"):
-        return Found.of_report(known["found"])
-    if find is None:
-        raise SatIntervalsError("the search range is auto: give it as numbers")
-    return find.search_range(left, right)
-
-
-def _survey(
-    known: Mapping[str, Any], find: Finds | None, left: Image, right: Image, config: Config, region: Window
-) -> Survey | None:
-    search = config.disparity.minimum, config.disparity.maximum
-    if known.get("survey"):
-        survey = Survey.of_report(known["survey"])
-        if (survey.region, survey.search) == (region, search):
-            return survey
-    return find.survey(left, right, region, search) if find else None
-
-
-def _rows_taken(survey: Survey | None, config: Config, left: Image, right: Image, missed: str) -> RowOffsets | None:
-    try:
-        return survey.taken(config.rows, missed) if survey else None
-    except SatIntervalsError as error:
-        raise SatIntervalsError(f"{left.path} and {right.path}: {error}") from None
 
 
 def origin_of(inputs: Mapping[str, Any]) -> str:
@@ -299,13 +251,17 @@ def remove_tiles(out: Path) -> None:
     folder_at(home).remove_if_empty()
 
 
-_version = cache(lambda: version("sat-intervals"))  # reading it takes 2 ms, and each tile compares manifests
+_version = cache(lambda: version("sat-intervals"))  # reading it takes 2 ms, and each tile asks for it
 
 
-def _manifest(
-    config: Config, inputs: Mapping[str, Any], region: Window, ranges: str | None, rows: RowOffsets | None
-) -> dict[str, Any]:
+def _made_by() -> dict[str, Any]:
+    """Return what decides the bytes of a tile in this process."""
+    return {"version": _version(), "kernels": FINGERPRINT, "layout": LAYOUT}
+
+
+def _manifest(prepared: Prepared[FilePair], inputs: Mapping[str, Any], region: Window) -> dict[str, Any]:
     """Return all that decides the bytes of a tile; of a calibration only its levels."""
+    config, ranges, rows = prepared.config, prepared.ranges, prepared.rows
     settings = config.model_dump(mode="json", exclude=_NOT_OF_TILES)
     levels = config.cuts
     if levels is not None:
@@ -316,11 +272,9 @@ def _manifest(
             "cut": config.fit_cut,
         }
     return {
-        **({"local_ranges": ranges} if ranges else {}),
+        **({"local_ranges": digest(ranges.report())} if ranges else {}),
         **({"rows": asdict(rows)} if rows else {}),
-        "version": _version(),
-        "kernels": FINGERPRINT,
-        "layout": LAYOUT,
+        **_made_by(),
         "settings": settings,
         "inputs": inputs,
         "region": asdict(region),

@@ -6,6 +6,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,15 +24,18 @@ from sat_intervals.match.postprocess import (
     with_halo,
 )
 from sat_intervals.match.warm_up import compile_kernels
+from sat_intervals.prepare.pair import FilePair
+from sat_intervals.prepare.prepared import Prepared, prepare
 from sat_intervals.products import INVALID
 from sat_intervals.progress import Progress
 from sat_intervals.raster import BLOCK, Image, Layer, open_image
 from sat_intervals.run.assemble import scale_of
+from sat_intervals.run.checks import checked_pair, checked_region
 from sat_intervals.run.connection import Connection
-from sat_intervals.run.inputs import check_unchanged
-from sat_intervals.run.job import Job, prepare
-from sat_intervals.run.pair import check_failures, match_jobs, measure_images
-from sat_intervals.run.search_range import Finder
+from sat_intervals.run.each import EachOnWorkers
+from sat_intervals.run.inputs import check_unchanged, describe_inputs
+from sat_intervals.run.job import Job, job_of
+from sat_intervals.run.pair import check_failures, match_jobs
 from sat_intervals.run.strips import raw_rows
 from sat_intervals.run.workers import Workers
 from sat_intervals.store.lock import locked
@@ -118,16 +122,19 @@ def _of_subject(
     """Match a subject, with two levels of the ladder at a time, and measure it."""
     gauge: _SubjectGauge | None = None
     with ExitStack() as stack:
-        find, pairs = Finder(workers, progress), pairs_of(rungs)
-        jobs = [_begun(find, subject, rungs, pair, folder / str(pair[1]), stack) for pair in pairs]
+        pairs = pairs_of(rungs)
+        images = checked_pair(subject.left, subject.right, subject.config)
+        each = EachOnWorkers(workers, progress)
+        without_cuts = at_levels(subject.config, 0.0, 0.0, None)  # and without local ranges
+        prepared = prepare(FilePair(*images), without_cuts, each, region=subject.window)
+        inputs = describe_inputs(*images, subject.config, {})
+        jobs = [_begun(prepared, inputs, subject, rungs, pair, folder / str(pair[1]), stack) for pair in pairs]
         # several tiles of one job keep all workers busy; stores of all jobs at once would fill the disk
         batches = [jobs] if len(jobs[0].store.grid) == 1 else [[job] for job in jobs]
         for number, batch in enumerate(batches):
             step = progress
             if in_blocks and len(batches) > 1:  # stages of each batch would begin again
                 step = partial(_of_all, progress, "levels", number, len(batches))
-            for job in batch:
-                measure_images(workers, job, step)
             for matched in match_jobs(workers, batch, step):
                 job = matched.job
                 check_failures(job, matched.failures)
@@ -139,14 +146,23 @@ def _of_subject(
     return gauge.gauge.measured()
 
 
-def _begun(find: Finder, subject: Subject, rungs: Ladders, pair: tuple[int, int], out: Path, stack: ExitStack) -> Job:
-    """Prepare the job that matches a subject at two rungs; open its store."""
+def _begun(
+    prepared: Prepared[FilePair],
+    inputs: dict[str, Any],
+    subject: Subject,
+    rungs: Ladders,
+    pair: tuple[int, int],
+    out: Path,
+    stack: ExitStack,
+) -> Job:
+    """Make the job that matches a subject at two rungs; open its store."""
     high, low = (subject.config.fit_cut if rung == OF_FITS else float(rungs.low[rung]) for rung in pair)
-    config = subject.config
+    config = prepared.config
     if config.fits:  # its tiles are those of V-fit, at any levels
         config = config.model_copy(update={"refinement": Refinement(method="vfit")})
     config = at_levels(config, high, low, None)
-    job = prepare(subject.left, subject.right, out, config, window=subject.window, pair=out.parent.name, find=find)
+    prepared, region = replace(prepared, config=config), checked_region(prepared.pair.left, subject.window)
+    job = job_of(prepared, out, inputs, {}, region, pair=out.parent.name)
     job = replace(job, has_files=False)
     job.begin()
     stack.callback(job.store.remove)

@@ -5,12 +5,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 from sat_intervals.config import Config, ConfigError, Volume, load_config
 from sat_intervals.errors import RunError
 from sat_intervals.match.matching_cost import VolumeOf
-from sat_intervals.match.normalization import ImageStatistics, PairStatistics, blocks, statistics_of
 from sat_intervals.match.schedule import Schedule
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress, add_seconds, logged_stage
@@ -18,10 +17,10 @@ from sat_intervals.raster import Image
 from sat_intervals.results import open_run
 from sat_intervals.run.assemble import assemble, end_tiles
 from sat_intervals.run.connection import Connection
-from sat_intervals.run.job import Job, prepare
-from sat_intervals.run.search_range import Finder
-from sat_intervals.run.tile import match_block, measure_block, trace_block
-from sat_intervals.run.workers import Task, Workers, check_not_full, reason, results
+from sat_intervals.run.each import EachOnWorkers
+from sat_intervals.run.job import Job, open_job
+from sat_intervals.run.tile import match_block, trace_block
+from sat_intervals.run.workers import Task, Workers, check_not_full, reason
 from sat_intervals.store.lock import locked
 from sat_intervals.store.tiles import BORDERS, COSTS, FAILURES, PIXELS, DamagedTilesError
 from sat_intervals.tiling import Tile, Window
@@ -86,8 +85,8 @@ def match_pair(
     config, out, seconds = _named(load_config(config), volume_of), Path(out), dict[str, float]()
     with Connection(config.cluster, out) as connection:
         with logged_stage(seconds, "start"):
-            finder = Finder(connection, progress, seconds)
-            job = prepare(left, right, out, config, window=window, overwrite=overwrite, find=finder)
+            each = EachOnWorkers(connection, progress)
+            job = open_job(left, right, out, config, window=window, overwrite=overwrite, each=each)
             job = replace(job, volume_of=volume_of)
         with locked(out):
             if not job.begin():
@@ -133,8 +132,6 @@ def match_and_assemble(job: Job, workers: Workers, seconds: dict[str, float], pr
     for attempt in range(_TRIES + 1):
         try:
             with logged_stage(seconds, "tiles"):
-                with logged_stage(seconds, "tiles.images"):
-                    measure_images(workers, job, progress)
                 for matched in match_jobs(workers, [job], progress) if job.waiting() else ():
                     check_failures(job, matched.failures)
                     add_seconds(seconds, matched.seconds)
@@ -144,24 +141,6 @@ def match_and_assemble(job: Job, workers: Workers, seconds: dict[str, float], pr
                 raise
             _LOG.warning("%s; trying this now", error)
     raise AssertionError  # not reached
-
-
-def measure_images(workers: Workers, job: Job, progress: Progress) -> None:
-    """Measure mean and standard deviation of both images and keep them, if the cost needs them and they are missing."""
-    if not job.has_statistics():
-        images = job.left, job.right
-        job.write_statistics(PairStatistics(*(_measured(workers, image, job, progress) for image in images)))
-
-
-def _measured(workers: Workers, image: Image, job: Job, progress: Progress) -> ImageStatistics:
-    windows, retries = blocks(image.height, image.width), job.config.cluster.retries
-    tasks = (Task(i, measure_block, (image, block), retries) for i, block in enumerate(windows))
-
-    def failed(_: int, error: BaseException) -> NoReturn:
-        raise RunError(f"{image.path} could not be measured: {reason(error)}") from error
-
-    found = dict(results(workers, tasks, failed, lambda done: progress("images", done, len(windows))))
-    return statistics_of(found[i] for i in range(len(windows)))
 
 
 def check_failures(job: Job, failures: dict[str, BaseException]) -> None:

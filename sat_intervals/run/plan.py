@@ -10,12 +10,13 @@ from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.memory import PROCESS_BYTES, check_strips, fitted, strip_bytes, tile_bytes, waiting_bytes
 from sat_intervals.match.schedule import handed_bytes
 from sat_intervals.match.warm_up import compile_kernels
+from sat_intervals.prepare.pair import FilePair
+from sat_intervals.prepare.prepared import prepare
 from sat_intervals.progress import Progress
 from sat_intervals.raster import BLOCK, Image, file_bytes, part_bytes
 from sat_intervals.run.checks import check_tiles, checked_pair, checked_region, fitted_to_jobs
-from sat_intervals.run.local_ranges import searched
+from sat_intervals.run.each import each_here
 from sat_intervals.run.pair import match_pair
-from sat_intervals.run.search_range import find_here
 from sat_intervals.run.state import files_of_run
 from sat_intervals.run.workers import cores_of_process, is_remote, readers, reason, tiles_at_once
 from sat_intervals.store.tiles import store_bytes
@@ -58,11 +59,13 @@ def plan(
     """
     config = resolved(load_config(config))
     left, right = checked_pair(left, right, config)
-    config, _, _ = searched(config, left, lambda: find_here(left, right, progress))
-    checked_pair(left, right, config)
+    region = checked_region(left, window)
+    no_rows = config.model_copy(update={"rows": "none"})
+    with each_here(progress) as each:
+        searched = prepare(FilePair(left, right), no_rows, each, region=window, looks=False).config
+    config = config.model_copy(update={"disparity": searched.disparity})
     config = fitted_to_jobs(config) if memory is None else fitted(config, memory, waiting=readers(config.cluster))
     workers = workers or tiles_at_once(config.cluster)
-    region = checked_region(left, window)
     strip = min(BLOCK, region.height), region.width
     if memory is not None:
         check_strips(*strip, config, memory)
@@ -123,7 +126,7 @@ def _expected(left: Image, right: Image, config: Config, workers: int, grid: Gri
     tiles = of_tiles * work / _work(Grid(window, one.tiles.size), one)
     # In the sample one of two tiles hands states on, in four wavefronts; in the run all but the last do, in three.
     paths = 1.5 * larger * seconds.get("tiles.trace", 0.0) * (1 - 1 / len(grid))
-    once = sum(seconds[stage] for stage in ("start", "kernels", "tiles.images", "inputs"))  # of whole images
+    once = sum(seconds[stage] for stage in ("start", "kernels", "inputs"))  # of whole images
     strips = larger * seconds["bands"] / min(workers, -(-grid.region.height // BLOCK))
     extra = paths / tiles if config.hands_states_on else work / pixels - 1
     return once + (tiles + paths) / min(workers, len(grid)) + strips + larger * seconds["files"], extra

@@ -9,6 +9,8 @@ import numpy as np
 from sat_intervals.config import Config, Disparity, calibration_of, unreached
 from sat_intervals.match.patch import patch_windows
 from sat_intervals.match.rows import Survey
+from sat_intervals.prepare.pair import is_plain
+from sat_intervals.prepare.search_range import COLLAR, collar_lines
 from sat_intervals.raster import Image, read_window
 from sat_intervals.run.job import Job
 from sat_intervals.run.source import frame_of
@@ -21,19 +23,14 @@ _NARROW_RANGE, _SHORT_RANGE = 3, 8
 _AMBIGUOUS_SHARE = 0.1
 # Share of valid pixels at the ends of the search range above which a run warns, and at one end to search further there.
 _AT_ENDS, _AT_END = 0.005, 0.001
-# Share of the pixels of an image that make a collar worth a warning, and rows that are looked at.
-COLLAR, _ROWS = 0.01, 8
+# Rows that are looked at.
+_ROWS = 8
 # Share of windows that meet no data from which it is asked if it is isolated, and of valid pixels that are few.
 _SPOILED, _FEW = 0.2, 0.2
 # Times the usual width of intervals that are wide.
 _WIDE = 2.0
 # Rows that make a pair badly resampled, and the distance of matches that makes it noisy.
 _ROW_OFFSET, _NOISE = 1.0, 0.55
-
-
-def is_plain(image: Image) -> bool:
-    """Return whether nothing declares pixels of an image as no data."""
-    return image.nodata is None and not image.use_mask and image.alpha is None and image.mask is None
 
 
 def quality_of(job: Job, tables: Tables) -> dict[str, Any]:
@@ -43,8 +40,8 @@ def quality_of(job: Job, tables: Tables) -> dict[str, Any]:
     read of each side; ``same``, whether both images have the same pixels.
     """
     looked = _look(job.left, job.right, job.store.grid.region) | {"no_data": _no_data(job, tables)}
-    looked["collars"] |= job.found.collars if job.found else {}
-    return looked | {"noise": job.survey and job.survey.noise}
+    looked["collars"] |= job.prepared.search.collars if job.prepared.search else {}
+    return looked | {"noise": job.prepared.survey and job.prepared.survey.noise}
 
 
 def _look(left: Image, right: Image, region: Window) -> dict[str, Any]:
@@ -110,23 +107,23 @@ def _collar(pixels: np.ndarray, state: np.ndarray) -> dict[str, float] | None:
 
 def warnings_of(job: Job, counts: Mapping[str, Any], quality: Mapping[str, Any]) -> list[str]:
     """Return the warnings about a run, one line each, the likeliest cause of all others first."""
-    paths, config, found = (job.left.path, job.right.path), job.config, job.survey and job.survey.rows
+    paths, config, survey = (job.left.path, job.right.path), job.config, job.prepared.survey
     of_data = [*doubts_of_images(job.left, job.right, quality), *_spoiled(job, counts, quality["no_data"]["left"])]
-    rows = rows_left(job.survey, config.rows, job.right.path)
-    was_found = job.found is not None
+    rows = rows_left(survey, config.rows, job.right.path)
+    was_found = job.prepared.search is not None
     of_range = _doubts_of_range(counts, config.disparity, paths[0], was_found=was_found)
     if (of_given := counts["agreement"])["outside"] > of_given["inside"]:
         of_data.append(
             f"{config.disparity.around}: {of_given['outside']} of {sum(of_given.values())} disparities are outside the "
             "intervals: check that x_right = x_left + disparity, and that it is of the left image"
         )
-    if job.missed:
-        of_pair = [f"{paths[0]} and {paths[1]}: {job.missed}"]
-    elif of_data or (found and found.contradiction):
+    if job.prepared.missed:
+        of_pair = [f"{paths[0]} and {paths[1]}: {job.prepared.missed}"]
+    elif of_data or (survey and survey.rows and survey.rows.contradiction):
         of_pair = rows
     else:  # where a given range is wrong, rows are, too
         of_pair = _rejected(counts, paths) or ([] if was_found else of_range) or [*rows, *of_range]
-    noise = noise_line(job.survey, paths) if config.cost.method == "census" and config.preset == "paper" else []
+    noise = noise_line(survey, paths) if config.cost.method == "census" and config.preset == "paper" else []
     missed = unreached(config)
     return [*of_data, *of_pair, *noise, *([f"{paths[0]}: {missed}"] if missed else [])]
 
@@ -192,16 +189,6 @@ def _usual_width(config: Config) -> float | None:
     expected = calibration_of(config).provenance.get("expected", ())
     found = [row["median_width"] for row in expected if row.get("coverage") == levels.coverage]
     return float(found[0]) if found else None
-
-
-def collar_lines(collars: Mapping[str, Any], paths: tuple[str, str]) -> list[str]:
-    """Return warnings of no data along the borders of images that nothing declares."""
-    return [
-        f"{path}: {100 * collars[side]['share']:.0f} % of the pixels are exactly {collars[side]['value']:.9g}, along "
-        f"its borders, and no no-data value is declared: if it is no data, give --nodata {collars[side]['value']:.9g}"
-        for side, path in zip(("left", "right"), paths, strict=True)
-        if side in collars
-    ]
 
 
 def noise_line(survey: Survey | None, paths: tuple[str, str]) -> list[str]:

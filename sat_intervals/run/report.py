@@ -62,7 +62,7 @@ def report_of(
     job: Job, tables: Tables, scale: ConfidenceScale, parts: Iterable[Mapping[str, Any]], seconds: dict[str, float]
 ) -> dict[str, Any]:
     """Return the content of run.json."""
-    grid, config, statistics = job.store.grid, job.config, job.statistics()
+    grid, config, prepared = job.store.grid, job.config, job.prepared
     tally = Tally(config.disparity.count, config.disparity.minimum)
     for part in parts:
         tally.merge(part.get("counts", {}))
@@ -75,11 +75,11 @@ def report_of(
         "finished": datetime.now(UTC).isoformat(timespec="microseconds"),  # distinguishes runs
         "settings": config.model_dump(mode="json"),
         "requested": {"disparity": job.requested},
-        "search": job.found and job.found.report(),
-        "survey": job.survey and job.survey.report(),
-        "rows": job.right.rows and asdict(job.right.rows),
+        "search": prepared.search and prepared.search.report(),
+        "survey": prepared.survey and prepared.survey.report(),
+        "rows": prepared.rows and asdict(prepared.rows),
         "origin": origin_of(job.inputs),
-        "local_ranges": job.local and job.local.report() | {"share": job.local.share},
+        "local_ranges": prepared.ranges and prepared.ranges.report() | {"share": prepared.ranges.share},
         "inputs": job.inputs,
         "tiles": {
             "region": asdict(grid.region),
@@ -90,7 +90,7 @@ def report_of(
         },
         "cost_span": config.cost_span,
         "calibration": _calibration(config),
-        "normalization": statistics and statistics.report(),
+        "normalization": prepared.statistics and prepared.statistics.report(),
         "ambiguity_percentiles": None if config.ambiguity is None else {"p1": scale.p1, "p99": scale.p99},
         "counts": counts,
         "counts_meaning": _COUNTS_MEANING,

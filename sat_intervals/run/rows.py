@@ -3,12 +3,14 @@
 from pathlib import Path
 from typing import Any
 
+from sat_intervals.config import load_config
 from sat_intervals.match.search_range import NoRangeError
+from sat_intervals.prepare.pair import FilePair
+from sat_intervals.prepare.prepared import prepare
 from sat_intervals.progress import Progress
 from sat_intervals.raster import open_image
+from sat_intervals.run.each import each_here
 from sat_intervals.run.quality import rows_left
-from sat_intervals.run.search_range import finder_here
-from sat_intervals.tiling import Window
 
 # Pixels of median row offset up to which rows correspond.
 _AGREE = 0.1
@@ -16,14 +18,14 @@ _AGREE = 0.1
 
 def compared_rows(left: Path, right: Path, progress: Progress) -> dict[str, Any]:
     """Return how far rows of a pair differ: ``text``, ``warnings`` (lines), ``search`` (range) and ``survey``."""
-    images = open_image(left), open_image(right)
-    with finder_here(progress) as finder:
+    pair = FilePair(open_image(left), open_image(right))
+    with each_here(progress) as each:
         try:
-            found = finder.search_range(*images)
+            prepared = prepare(pair, load_config({"rows": "none"}), each)
         except NoRangeError as error:
             return {"text": "not compared: too few matches", "warnings": [str(error)], "search": None, "survey": None}
-        search = found.minimum, found.maximum
-        survey = finder.survey(*images, Window(0, 0, images[0].height, images[0].width), search)
+    survey = prepared.survey
+    assert survey is not None  # it was looked at
     text = "not compared: too few matches"
     if rows := survey.rows:
         is_taken = survey.is_large and not rows.contradiction
@@ -35,4 +37,4 @@ def compared_rows(left: Path, right: Path, progress: Progress) -> dict[str, Any]
             f"leaves {rows.after[0]:.2f} px on other matches: rows {verdict}"
         )
     warnings = rows_left(survey, "auto", str(right))
-    return {"text": text, "warnings": warnings, "search": search, "survey": survey.report()}
+    return {"text": text, "warnings": warnings, "search": survey.search, "survey": survey.report()}

@@ -40,7 +40,7 @@ def frame_of(job: Job, tile: Tile) -> Frame:
 def read_source(job: Job, block: Tile, ranges: LocalRanges | None, seconds: dict[str, float]) -> Source:
     """Read both images in the windows of a block's tiles."""
     job.check_version()  # before any work
-    statistics, network = job.statistics(), job.volume_of or network_of(job.config.cost, job.inputs)
+    statistics, network = job.prepared.statistics, job.volume_of or network_of(job.config.cost, job.inputs)
     areas = (patch_areas(frame_of(job, tile), job.config, ranges) for tile in job.store.grid.within(block.core))
     windows = [view_windows(of_tile, job.config) for of_tile in areas]
     left, right = map(hull, zip(*windows, strict=True))

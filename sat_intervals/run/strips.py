@@ -16,10 +16,10 @@ from sat_intervals.match.memory import STRIP_PIXELS
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, halo, postprocess_strip
 from sat_intervals.match.refinement import pixel_windows, pixels_of
 from sat_intervals.match.statistics import Tally
+from sat_intervals.prepare.local import given_disparities
 from sat_intervals.progress import Progress
 from sat_intervals.raster import BLOCK, RUN_FILES, codec_versions, compressed, factors, halved, read_views
 from sat_intervals.run.job import Job
-from sat_intervals.run.local_ranges import given_disparities
 from sat_intervals.run.state import files_of_run
 from sat_intervals.run.workers import Task, Workers, check_not_full, computing, picklable_errors, reason, results
 from sat_intervals.store.arrays import DamagedFileError

@@ -11,7 +11,6 @@ from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.kernels.sgm import LAST, WAVEFRONTS, Borders, Edge
 from sat_intervals.match.borders import Border, Place, borders_of, in_order, rehulled, sources, trace_area
 from sat_intervals.match.local_ranges import LocalRanges, narrowed
-from sat_intervals.match.normalization import Moments, moments
 from sat_intervals.match.patch import (
     Frame,
     Patch,
@@ -23,24 +22,17 @@ from sat_intervals.match.patch import (
 from sat_intervals.match.schedule import Step, needs
 from sat_intervals.products import NO_DISPARITY
 from sat_intervals.progress import timed
-from sat_intervals.raster import Image, read_window
 from sat_intervals.run.job import Job
 from sat_intervals.run.source import Source, costed, frame_of, read_source
 from sat_intervals.run.workers import computing, picklable_errors
 from sat_intervals.store.arrays import numbered
 from sat_intervals.store.tiles import BORDERS
-from sat_intervals.tiling import Tile, Window
+from sat_intervals.tiling import Tile
 
 Handed = dict[Place, list[Edge]]
 """What tiles hand on in a wavefront: for each view, by place in the grid of tiles."""
 
 _LOG = logging.getLogger(__name__)
-
-
-def measure_block(image: Image, block: Window) -> Moments:
-    """Compute the moments of a block of an image; runs on a worker."""
-    with picklable_errors():
-        return moments(*read_window(image, block))
 
 
 def match_block(job: Job, block: Tile) -> None:

@@ -14,9 +14,9 @@ from sat_intervals.kernels.cost import Codes, between
 from sat_intervals.kernels.intervals import regularize
 from sat_intervals.kernels.matching import match_costs
 from sat_intervals.kernels.sweeps import Settings
-from sat_intervals.match.in_memory import match_arrays
 from sat_intervals.match.patch import Frame, match_patch, patch_windows
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_rows
+from sat_intervals.prepare.in_memory import match_arrays
 from sat_intervals.products import BOUND_STEPS, IMPOSSIBLE_COST, INVALID, NO_DATA, NO_DISPARITY, REJECTED
 from sat_intervals.tiling import View, Window
 

@@ -25,7 +25,7 @@ from sat_intervals.match.patch import kernel_settings
 from sat_intervals.match.whole import cut, whole_view
 from sat_intervals.products import COSINE_STEPS, IMPOSSIBLE_COST, INVALID
 from sat_intervals.results import open_results
-from sat_intervals.run.job import prepare
+from sat_intervals.run.job import open_job
 from sat_intervals.run.tile import match_block
 from sat_intervals.show.cost_curve import read_curve
 from sat_intervals.tiling import Window
@@ -278,9 +278,8 @@ def test_match_tile__other_weights_on_a_worker_are_noticed(tmp_path):
     left, right = masked_images(60, 80)
     images = write(tmp_path / "left.tif", left), write(tmp_path / "right.tif", right)
     file = write_network(tmp_path / "network.onnx", random_weights())
-    job = prepare(*images, tmp_path / "out", settings(-4, 6, file))
+    job = open_job(*images, tmp_path / "out", settings(-4, 6, file))
     job.begin()
-    job.write_statistics(PairStatistics(ImageStatistics(500.0, 80.0), ImageStatistics(500.0, 80.0)))
     write_network(file, random_weights(seed=1))
     for content in (file.read_bytes(), file.read_bytes()[:99]):
         file.write_bytes(content)
@@ -291,7 +290,7 @@ def test_match_tile__other_weights_on_a_worker_are_noticed(tmp_path):
 def test_match_tile__another_onnxruntime_on_a_worker_is_noticed(tmp_path, network_file, monkeypatch):
     left, right = masked_images(60, 80)
     images = write(tmp_path / "left.tif", left), write(tmp_path / "right.tif", right)
-    job = prepare(*images, tmp_path / "out", settings(-4, 6, network_file))
+    job = open_job(*images, tmp_path / "out", settings(-4, 6, network_file))
     job.begin()
     installed = version("sat-intervals")
     monkeypatch.setattr("sat_intervals.run.job.version", lambda name: "0.1" if name == "onnxruntime" else installed)

@@ -23,9 +23,8 @@ from sat_intervals.config import Config
 from sat_intervals.config.weights import weights_file
 from sat_intervals.kernels.cost import Codes, between, census
 from sat_intervals.kernels.matching import cost_volume
-from sat_intervals.match.in_memory import _moments
 from sat_intervals.match.mccnn import load_network
-from sat_intervals.match.normalization import statistics_of
+from sat_intervals.match.normalization import moments, statistics_of
 from sat_intervals.match.patch import kernel_settings
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DATA
 
@@ -291,7 +290,7 @@ def test_features__have_the_cosines_of_pandora(pandora, shared_data, tmp_path, k
     weights = trained_network(shared_data, tmp_path / "mb.onnx") if kind == "fp32" else None
     theirs = -mccnn_peer(pandora, folder, (minimum, maximum), weights)
     network = load_network(weights_file(str(weights or "full")))
-    statistics = [statistics_of(_moments(np.ma.asarray(image))) for image in images]
+    statistics = [statistics_of([moments(image, np.zeros(image.shape))]) for image in images]
     left, right = (
         network(((image - statistics.mean) / statistics.deviation).astype(np.float32))
         for image, statistics in zip(images, statistics, strict=True)

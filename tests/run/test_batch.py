@@ -21,7 +21,7 @@ from sat_intervals.raster import write_layer
 from sat_intervals.results import open_run
 from sat_intervals.run.batch import Steps, match_batch
 from sat_intervals.run.checks import fitted_to_jobs
-from sat_intervals.run.job import prepare
+from sat_intervals.run.job import open_job
 from sat_intervals.run.pair import match_jobs, match_pair
 from sat_intervals.run.plan import plan
 from sat_intervals.run.workers import Outcome, parse_memory
@@ -194,7 +194,7 @@ class SlowTraces:
 def test_match_jobs__yields_a_job_once_when_nothing_of_it_is_under_way(images, tmp_path):
     """Steps may still be traced whose blocks have been matched meanwhile: the job would be yielded again."""
     settings = {"disparity": {"minimum": -18, "maximum": 40}, "tiles": {"size": 64}}
-    job, workers = prepare(images / "left1.tif", images / "right1.tif", tmp_path, settings), SlowTraces()
+    job, workers = open_job(images / "left1.tif", images / "right1.tif", tmp_path, settings), SlowTraces()
     job.begin()
     traced = [workers.traced for _ in match_jobs(workers, [job], lambda stage, done, total: None)]
     assert traced == [workers.traced]
@@ -362,7 +362,7 @@ def test_status__tells_done_and_failed_tiles_from_the_store(images, tmp_path):
     (out / "run.json").unlink()
     for name in ("0_1", "1_1"):
         (out / "tiles" / "tiles" / f"{name}.npz").unlink()
-    prepare(images / "left1.tif", images / "right1.tif", out, settings).store.write("failures", "0_1", reason="full")
+    open_job(images / "left1.tif", images / "right1.tif", out, settings).store.write("failures", "0_1", reason="full")
     result = invoke("status", out)
     assert "4 of 6 tiles done, 1 failed, 1 left; no run is active" in result.stdout
     assert "; 21 path states are handed on\n" in result.stdout  # 5 tiles in three wavefronts, 6 with their matching

@@ -20,7 +20,7 @@ from sat_intervals.errors import ChangedInputError
 from sat_intervals.evaluate.disparity import evaluate_run
 from sat_intervals.raster import write_layer
 from sat_intervals.run.calibrate import check_subjects
-from sat_intervals.run.job import prepare
+from sat_intervals.run.job import open_job
 from sat_intervals.run.measure import Subject, measure_subjects, truth_of
 
 
@@ -240,13 +240,13 @@ def test_match__warns_of_a_coverage_that_the_calibration_does_not_reach(scene, t
     assert report["calibration"]["reached"] is False
 
 
-def test_prepare__tiles_depend_on_the_levels_of_a_calibration_only(scene, tmp_path):
+def test_open_job__tiles_depend_on_the_levels_of_a_calibration_only(scene, tmp_path):
     """A calibration with another name or provenance resumes a run, one with other levels does not."""
     content = yaml.safe_load((scene / "calibration.yaml").read_text())
 
     def job(coverage, **changes):
         settings = settings_with(scene, coverage=coverage, calibration=content | changes)
-        return prepare(scene / "left.tif", scene / "right.tif", tmp_path / "out", settings)
+        return open_job(scene / "left.tif", scene / "right.tif", tmp_path / "out", settings)
 
     one, other, higher = job(0.9), job(0.9, name="other", provenance={}), job(0.95)
     assert one.manifest == other.manifest != higher.manifest

@@ -17,7 +17,7 @@ from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.products import INVALID
 from sat_intervals.results import open_run
 from sat_intervals.run import pair as run
-from sat_intervals.run.job import prepare
+from sat_intervals.run.job import open_job
 from sat_intervals.run.tile import match_block
 from sat_intervals.store.manifest import differences, digest
 from sat_intervals.tiling import Window
@@ -193,9 +193,9 @@ def test_match_pair__a_matcher_without_a_name_needs_one(pair, tmp_path, matcher)
 
 def test_match_block__of_another_version_is_refused(pair, tmp_path):
     left, right, settings = pair
-    job = prepare(left, right, tmp_path, in_tiles(settings, 64))
+    job = open_job(left, right, tmp_path, in_tiles(settings, 64))
     job.begin()
-    other = replace(job, store=replace(job.store, run="another"))
+    other = replace(job, manifest=job.manifest | {"kernels": "another"})
     with pytest.raises(RunError, match="this worker has another version of sat-intervals"):
         match_block(other, next(iter(job.store.grid)))
 

@@ -25,7 +25,7 @@ from sat_intervals.raster import BLOCK, OutputError, OutputWriter, read_layers, 
 from sat_intervals.results import open_run
 from sat_intervals.run import assemble, pair, strips
 from sat_intervals.run.checks import check_tiles
-from sat_intervals.run.job import prepare
+from sat_intervals.run.job import open_job
 from sat_intervals.run.pair import match_pair
 from sat_intervals.store.tiles import DamagedTilesError
 from sat_intervals.tiling import Window
@@ -202,7 +202,7 @@ def wide_job(folder: Path):
     write_layer(folder / "wide.tif", np.ones((600, 5000), np.uint8), 0, PLACE)
     search = {"minimum": 0, "maximum": 3}
     settings = {"preset": "paper", "disparity": search, "tiles": {"overlap": 100}}  # no path states
-    return prepare(folder / "wide.tif", folder / "wide.tif", folder / "out", settings)
+    return open_job(folder / "wide.tif", folder / "wide.tif", folder / "out", settings)
 
 
 def test_strip_bytes__bounds_what_writing_a_strip_takes(tmp_path):

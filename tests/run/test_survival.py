@@ -23,7 +23,7 @@ from helpers import COMMAND, OUTPUTS, PATIENCE, PLACE, wait_until, write_pair
 from sat_intervals.demo import make_scene
 from sat_intervals.raster import write_layer
 from sat_intervals.run import pair as run
-from sat_intervals.run.job import prepare
+from sat_intervals.run.job import open_job
 from sat_intervals.run.submit import DaskWorkers
 from sat_intervals.store.lock import locked
 
@@ -325,7 +325,7 @@ def test_match_jobs__keeps_few_tiles_in_flight_however_many_there_are(pair, tmp_
     futures, known = [], []
     image = tmp_path / "wide.tif"
     write_layer(image, np.ones((64 * 40, 64 * 50), np.uint16), 0, PLACE)
-    job = prepare(image, image, tmp_path / "out", yaml.safe_load((pair / "settings.yaml").read_text()))
+    job = open_job(image, image, tmp_path / "out", yaml.safe_load((pair / "settings.yaml").read_text()))
     with locked(job.out):
         job.begin()
         with (

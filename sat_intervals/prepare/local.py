@@ -1,16 +1,14 @@
-"""The search range and the local ranges of a pair: given, found, or read from the raster that the user gives."""
+"""Local search ranges that files give: a raster of ranges, or the disparities of another matcher."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from sat_intervals.config import Config
+from sat_intervals.config import Config, Disparity
 from sat_intervals.config.sections import MOST_PIXELS
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.match.around import CELL, ranges_around, with_hull
+from sat_intervals.match.around import CELL, ranges_around
 from sat_intervals.match.local_ranges import LocalRanges
-from sat_intervals.match.search_range import Found, with_range
 from sat_intervals.products import RANGES
 from sat_intervals.raster import (
     Image,
@@ -29,21 +27,14 @@ from sat_intervals.tiling import Window
 _STRIP = 256
 
 
-def searched(config: Config, left: Image, find: Callable[[], Found]) -> tuple[Config, Found | None, LocalRanges | None]:
-    """Return settings with the search range as numbers, what ``find`` found if needed, and local ranges, if any."""
-    search, found, local = config.disparity, None, None
+def given_ranges(search: Disparity, left: Image) -> tuple[LocalRanges, str] | None:
+    """Return the local ranges that settings give by a file, and which file; None if they give none."""
     if search.grid:
         tags_beside(search.grid, identity(left.path))
-        local = read_ranges(search.grid, left)
-        config = with_hull(config, local, search.grid) if search.is_auto else config
-    elif search.around:
-        local = _ranges_around(search.around, left, search.margin)
-        config = with_hull(config, local, search.around) if search.is_auto else config
-    elif search.is_auto or search.local:
-        found = find()
-        local = found.local if search.local else None
-        config = with_range(config, found) if search.is_auto else config
-    return config, found, local and local.clipped(config.disparity.minimum, config.disparity.maximum)
+        return read_ranges(search.grid, left), search.grid
+    if search.around:
+        return _ranges_around(search.around, left, search.margin), search.around
+    return None
 
 
 def _ranges_around(path: str, left: Image, margin: int) -> LocalRanges:

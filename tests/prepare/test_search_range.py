@@ -13,12 +13,11 @@ from matplotlib.image import imread
 from sat_intervals import RunError, SatIntervalsError, match_pair, open_image
 from sat_intervals.demo import make_scene
 from sat_intervals.match import schedule
+from sat_intervals.prepare import prepared
+from sat_intervals.prepare.local import read_ranges
 from sat_intervals.raster import write_layer
 from sat_intervals.results import open_results
 from sat_intervals.run import pair as run_pair
-from sat_intervals.run.local_ranges import read_ranges
-from sat_intervals.run.pair import prepare
-from sat_intervals.run.search_range import Finder
 from sat_intervals.show.report.contents import Pixels
 
 
@@ -51,16 +50,11 @@ def test_match_pair__an_interrupted_run_keeps_its_range(folder, tmp_path, monkey
     with np.load(tmp_path / "tiles/once/range.npz") as kept:
         stored = json.loads(kept["meta"])["found"]
     monkeypatch.undo()
-    for name in ("search_range", "survey"):
-        monkeypatch.setattr(Finder, name, lambda *_: pytest.fail("searched again"))
+    for name in ("found_range", "measured_parallax"):
+        monkeypatch.setattr(prepared, name, lambda *_: pytest.fail("searched again"))
     report = run(folder, tmp_path)
     assert report["search"]["minimum"] == stored["minimum"]
     assert not (tmp_path / "tiles").exists()
-
-
-def test_prepare__a_range_to_be_found_needs_a_search(folder, tmp_path):
-    with pytest.raises(SatIntervalsError, match="auto: give it as numbers"):
-        prepare(folder / "left.tif", folder / "right.tif", tmp_path, {})
 
 
 def test_match_pair__takes_no_range_of_other_images(folder, tmp_path, monkeypatch):
@@ -71,7 +65,7 @@ def test_match_pair__takes_no_range_of_other_images(folder, tmp_path, monkeypatc
     def search(*_):
         raise RunError("searched again")
 
-    monkeypatch.setattr(Finder, "search_range", search)
+    monkeypatch.setattr(prepared, "found_range", search)
     with pytest.raises(RunError, match="searched again"):
         match_pair(folder / "right.tif", folder / "left.tif", tmp_path, {})
 

@@ -1,7 +1,7 @@
 """Matching of two arrays in memory as one tile, without files, store or scheduler."""
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -10,18 +10,13 @@ import xarray as xr
 
 from sat_intervals.config import Config, load_config, resolved, unreached
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.kernels.rows import RowOffsets, shift_rows
-from sat_intervals.match.around import CELL, ranges_around, with_agreement, with_hull
+from sat_intervals.match.around import with_agreement
 from sat_intervals.match.labelled import labelled
-from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.memory import check_memory, volume_bytes
-from sat_intervals.match.normalization import Moments, PairStatistics, blocks, moments, statistics_of
-from sat_intervals.match.rows import Survey
-from sat_intervals.match.sampling import look, spots
-from sat_intervals.match.search_range import Found, NoRangeError, find_range, finest_step, reduced, with_range
-from sat_intervals.match.whole import cut, match_whole, whole_view
+from sat_intervals.match.whole import match_whole
+from sat_intervals.prepare.pair import ArrayPair
+from sat_intervals.prepare.prepared import prepare
 from sat_intervals.products import as_json
-from sat_intervals.tiling import Window
 
 _LOG = logging.getLogger(__name__)
 
@@ -97,44 +92,19 @@ def _matched(left: Array, right: Array, config: Config, given: np.ndarray | None
     if missed := unreached(config):
         _LOG.warning("%s", missed)
     pixels = _pixels(left, "left"), _pixels(right, "right")
-    _check_rows(*pixels)
-    if config.disparity.grid or config.disparity.around:
-        raise SatIntervalsError("a raster needs files: use match_pair, or disparity local, or intervals_around")
-    is_given = not config.disparity.is_auto
-    config, ranges = _searched(*pixels, config, given)
-    _check_fit(*pixels, config)
-    images = _image(pixels[0]), _image(pixels[1])
-    rows = None
-    if config.rows == "auto":
-        right_image, rows = _with_rows(*images, config, is_given=is_given)
-        images = images[0], right_image
-    statistics = None
-    if config.cost.needs_statistics:
-        statistics = PairStatistics(*(statistics_of(_moments(image)) for image in images))
-    final = match_whole(*images, config, statistics, ranges)
+    _check_shapes(*pixels, given)
+    if not config.disparity.is_auto:
+        _check_memory(pixels[0], config)
+    prepared = prepare(ArrayPair(_image(pixels[0]), _image(pixels[1]), given), config, looks=False)
+    config, images = prepared.config, prepared.pair.images
+    _check_memory(pixels[0], config)
+    final = match_whole(*images, config, prepared.statistics, prepared.ranges)
     labels = left if isinstance(left, xr.DataArray) else xr.DataArray(images[0], dims=("y", "x"))
     if given is not None:
         final = with_agreement(final, given)
     attributes = {"preset": config.preset} if config.preset else {}
-    return labelled(final, labels, attributes | ({"rows": as_json(asdict(rows), indent=None)} if rows else {}))
-
-
-def _searched(
-    left: np.ma.MaskedArray, right: np.ma.MaskedArray, config: Config, given: np.ndarray | None
-) -> tuple[Config, LocalRanges | None]:
-    """Return settings with the search range as numbers, and local ranges, if any."""
-    local = None
-    if given is not None:
-        if given.shape != left.shape:
-            raise SatIntervalsError(f"the disparities are {given.shape}, the left array {left.shape}: give one a pixel")
-        rows = (given[row : row + CELL] for row in range(0, len(given), CELL))
-        local = ranges_around(rows, config.disparity.margin)
-        config = with_hull(config, local, "the array of disparities") if config.disparity.is_auto else config
-    elif config.disparity.is_auto or config.disparity.local:
-        found = _found(_image(left), _image(right))
-        local = found.local if config.disparity.local else None
-        config = with_range(config, found) if config.disparity.is_auto else config
-    return config, local and local.clipped(config.disparity.minimum, config.disparity.maximum)
+    rows = {"rows": as_json(asdict(prepared.rows), indent=None)} if prepared.rows else {}
+    return labelled(final, labels, attributes | rows)
 
 
 def _pixels(array: Array, side: str) -> np.ma.MaskedArray:
@@ -160,35 +130,7 @@ def _image(pixels: np.ma.MaskedArray) -> np.ma.MaskedArray:
     return np.ma.masked_invalid(pixels.astype(dtype))
 
 
-def _found(left: np.ma.MaskedArray, right: np.ma.MaskedArray) -> Found:
-    """Find the search range of two images; see `find_range`."""
-    step = finest_step(left.shape[0], max(left.shape[1], right.shape[1]))
-    small = [reduced(image.filled(0), np.ma.getmaskarray(image).view(np.uint8), step) for image in (left, right)]
-    try:
-        return find_range(small[0], small[1], step, left.shape)[0].fitted(right.shape[1])
-    except NoRangeError as error:
-        raise NoRangeError(
-            f"the arrays have no common search range: {error}: give disparity minimum and maximum"
-        ) from None
-
-
-def _with_rows(
-    left: np.ma.MaskedArray, right: np.ma.MaskedArray, config: Config, *, is_given: bool
-) -> tuple[np.ma.MaskedArray, RowOffsets | None]:
-    """Return the right image at the rows of the left one, itself if they correspond, and the offsets taken out."""
-    views, search = (whole_view(left), whole_view(right)), (config.disparity.minimum, config.disparity.maximum)
-    found = (look(spot, *map(cut, views, spot.views)) for spot in spots(views[0].window, *search))
-    survey = Survey.of_looks(views[0].window, search, [one for one in found if one], right.shape)
-    rows = survey.taken(config.rows, survey.missed(lambda: _found(left, right)) if is_given else "")
-    if rows is None:
-        return right, None
-    first, count, *places = rows.read(0, 0, *right.shape)
-    wider = cut(views[1], Window(first, 0, count, right.shape[1]))
-    pixels, state = shift_rows(wider.pixels, wider.state, *places)
-    return np.ma.array(pixels, mask=state != 0), rows
-
-
-def _check_rows(left: np.ndarray, right: np.ndarray) -> None:
+def _check_shapes(left: np.ndarray, right: np.ndarray, given: np.ndarray | None) -> None:
     if left.shape[0] != right.shape[0]:
         raise SatIntervalsError(
             f"the left array has {left.shape[0]} rows, the right {right.shape[0]}, but rows must correspond: "
@@ -196,19 +138,14 @@ def _check_rows(left: np.ndarray, right: np.ndarray) -> None:
         )
     if 0 in left.shape or 0 in right.shape:
         raise SatIntervalsError(f"nothing to match: shapes {left.shape} and {right.shape}")
+    if given is not None and given.shape != left.shape:
+        raise SatIntervalsError(f"the disparities are {given.shape}, the left array {left.shape}: give one a pixel")
 
 
-def _check_fit(left: np.ndarray, right: np.ndarray, config: Config) -> None:
-    config.disparity.check_images("the left array", left.shape[1], "the right array", right.shape[1])
+def _check_memory(left: np.ndarray, config: Config) -> None:
     rows, columns = left.shape
     check_memory(
         volume_bytes(rows, columns, config),
         f"{rows} x {columns} pixels x {config.disparity.count} disparities",
         "write the arrays to files and use match_pair, which works in tiles",
     )
-
-
-def _moments(image: np.ma.MaskedArray) -> Iterator[Moments]:
-    """Moments of the blocks of an image, in order."""
-    for block in blocks(*image.shape):
-        yield moments(image.data[block.slices], np.ma.getmaskarray(image)[block.slices])
