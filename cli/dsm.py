@@ -160,7 +160,7 @@ def dsm(
     are no data.
 
     Where several OUT overlap, their intervals are averaged, narrow ones with the most weight. Where they do not meet,
-    their hull is written and agreement is 0.
+    agreement is 0, and their hull and the height of the narrowest are written.
     """
     from sat_intervals.cli.console import Console
     from sat_intervals.heights.dsm import make_surface

@@ -18,7 +18,8 @@ def fused(gathered: Sequence[np.ndarray]) -> np.ndarray:
 
     Heights and middles of intervals are means weighted by ``1 / width^2``; the width is that of the mean weight. It is
     not divided by the root of the number of runs: errors of pairs of the same place are correlated. Where the intervals
-    do not meet, their hull is taken. Heights of runs without intervals count where no run has one.
+    do not meet, their hull is taken, and the height of the narrowest: a mean may be in none of them. Heights of runs
+    without intervals count where no run has one.
     """
     layers = np.stack(gathered, axis=1)  # of each layer, the cells of all runs
     count = layers[COUNT].sum(axis=0)
@@ -31,6 +32,8 @@ def fused(gathered: Sequence[np.ndarray]) -> np.ndarray:
     if len(gathered) > 1:
         width = np.maximum(uppers - lowers, _NARROWEST)
         height = np.where(np.isfinite(width).any(axis=0), _mean(width**-2, heights), height)
+        narrowest = np.where(np.isnan(width), np.inf, uppers - lowers).argmin(axis=0)[np.newaxis]
+        height = np.where(several & ~meeting, np.take_along_axis(heights, narrowest, axis=0)[0], height)
         middle, half = _mean(width**-2, (lowers + uppers) / 2), _mean(width**-2, width**2) ** 0.5 / 2
         lower = np.where(several & meeting, middle - half, np.fmin.reduce(lowers))
         upper = np.where(several & meeting, middle + half, np.fmax.reduce(uppers))

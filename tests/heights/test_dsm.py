@@ -160,16 +160,16 @@ def test_make_surface__keeps_the_surface_whose_grid_it_takes(tmp_path):
 
 
 def test_make_surface__of_several_runs_is_their_mean_where_they_meet(tmp_path):
-    # Three cells 10 m apart. One run says 9 to 12 in each, the other 10 to 13, 29 to 32, and nothing.
+    # Three cells 10 m apart. One run says 9 to 12 in each, the other 10 to 13, 29.5 to 32, and nothing.
     one = write_points(tmp_path / "a", [0.5, 10.5, 20.5], [-0.5] * 3, [10.0] * 3, confidence=1.0)
-    two = write_points(tmp_path / "b", [0.5, 10.5, 20.5], [-0.5] * 3, [11.0, 30.0, np.nan], confidence=0.0)
+    two = write_points(tmp_path / "b", [0.5, 10.5, 20.5], [-0.5] * 3, [11.0, 30.0, np.nan], [1, 0.5, 1], confidence=0.0)
     for outs in ([one, two], [two, one]):
         surface, place, report = surface_of(outs, tmp_path, radius=0.6)
         i, j = cell_of(place, LEFT, TOP)
         cells = surface[:, i, [j, j + 10, j + 20]]
         assert_allclose(cells[BAND["height_lower"]], [9.5, 9, 9], atol=1e-4)
         assert_allclose(cells[BAND["height_upper"]], [12.5, 32, 12], atol=1e-4)
-        assert_allclose(cells[BAND["height"]], [10.5, 20, 10], atol=1e-4)
+        assert_allclose(cells[BAND["height"]], [10.5, 30, 10], atol=1e-4)
         assert_allclose(cells[BAND["confidence"]], [0.5, 0.5, 1.0], atol=1e-4)
         assert_array_equal(cells[BAND["count"]], [2, 2, 1])
         assert_array_equal(cells[BAND["agreement"]], [1, 0, np.nan])
@@ -184,6 +184,21 @@ def test_make_surface__of_several_runs_follows_the_narrow_intervals(tmp_path):
     surface, place, _ = surface_of([one, two], tmp_path, radius=0.6)
     i, j = cell_of(place, LEFT, TOP)
     assert_allclose(surface[:3, i, j], [10.9, 10.95 - 1.3416 / 2, 10.95 + 1.3416 / 2], atol=1e-4)
+
+
+def test_make_surface__of_runs_that_do_not_meet_has_a_height_that_one_of_them_has(tmp_path):
+    random = np.random.default_rng(4)
+    x, y = np.meshgrid(np.arange(0.5, 30), -np.arange(0.5, 20))
+    heights, halves = random.uniform(0, 60, (3, *x.shape)), random.uniform(0.5, 4, (3, *x.shape))
+    runs = [
+        write_points(tmp_path / str(k), x, y, *given) for k, given in enumerate(zip(heights, halves, halves, strict=True))
+    ]
+    surface, place, _ = surface_of(runs, tmp_path, radius=0.1)
+    i, j = cell_of(place, LEFT + x, TOP + y)
+    apart = surface[BAND["agreement"], i, j] == 0
+    narrowest = np.take_along_axis(heights, halves.argmin(axis=0)[np.newaxis], axis=0)[0]
+    assert apart.mean() > 0.9
+    assert_allclose(surface[BAND["height"], i, j][apart], narrowest[apart], atol=1e-3)
 
 
 def test_make_surface__does_not_depend_on_its_tiles(tmp_path, monkeypatch):
