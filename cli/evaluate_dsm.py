@@ -14,7 +14,7 @@ _FILES = "dsm-accuracy.json", "dsm-accuracy.md", "dsm-reliability.png", "dsm-err
 
 @dataclass(frozen=True)
 class Details:
-    """What is evaluated of a surface model beside all cells, and the folder for pictures."""
+    """What is evaluated of a surface model beside all cells, and the folder for pictures, which is made."""
 
     classes: Path | None
     pictures: Path | None
@@ -22,12 +22,12 @@ class Details:
     overwrite: bool
 
     def check_folder(self, folder: Path, surface: Surface) -> None:
-        """Raise if there is no such folder, or files in it would be replaced."""
+        """Raise if the folder is a file, or files in it would be replaced."""
         from sat_intervals.raster.identity import check_not_replaced
         from sat_intervals.raster.publishing import check_free
 
-        if not folder.is_dir():
-            raise click.UsageError(f"--pictures {folder} is not a folder: give an existing one.")
+        if folder.exists() and not folder.is_dir():
+            raise click.UsageError(f"--pictures {folder} is not a folder: choose another name.")
         paths = [folder / name for name in _FILES]
         check_not_replaced([surface.dsm, surface.reference, self.classes], paths)
         for path in paths:
@@ -38,12 +38,14 @@ class Details:
         from sat_intervals.cli.tables import surface_markdown
         from sat_intervals.evaluate.comparison import open_comparison
         from sat_intervals.evaluate.dsm import read_profile
-        from sat_intervals.raster.publishing import write_file, write_record
+        from sat_intervals.raster.publishing import failing, write_file, write_record
         from sat_intervals.show.accuracy import draw_error_map, draw_height_profile, draw_reliability
 
         figures, table, reliability, errors, heights = paths = [folder / name for name in _FILES]
         compared = open_comparison(surface.dsm, surface.reference, report["registration"])
         profile = read_profile(compared, self.line)
+        with failing(figures):
+            folder.mkdir(parents=True, exist_ok=True)
         write_record(figures, {"software": "sat-intervals"} | report)
         write_file(table, f"<!-- sat-intervals -->\n{surface_markdown(str(surface.dsm), report)}".encode())
         draw_reliability(report, reliability, surface.dsm.name)

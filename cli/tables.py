@@ -133,7 +133,7 @@ def _surface_table(report: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
     named = [("all cells", report["all"])]
     if report["registration"]:
         named = [("all cells, before registration", report["before"]), ("all cells, after", report["all"])]
-    for key, label in (("slope", "slope {} degrees"), ("width", "width {} m")):
+    for key, label in (("slope", "slope {} degrees"), ("half_width", "half width {} m")):
         for kind in report[key]:
             ends = f"{kind['from']:g} to {kind['to']:g}" if kind["to"] is not None else f"from {kind['from']:g}"
             named.append((label.format(ends), kind))

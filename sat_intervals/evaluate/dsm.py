@@ -13,9 +13,9 @@ from sat_intervals.evaluate.comparison import Comparison, check_common, compared
 from sat_intervals.raster import read_heights, read_layers, read_place, read_small_layers, read_tags
 from sat_intervals.tiling import Window
 
-# Limits of classes: slope of the reference in degrees, width of the interval in metres.
+# Limits of classes: slope of the reference in degrees, half width of the interval in metres.
 SLOPES = (0.0, 5.0, 15.0, 30.0, 45.0, 90.0)
-WIDTHS = (0.0, 1.0, 2.0, 5.0, 10.0, 20.0, np.inf)
+HALF_WIDTHS = (0.0, 0.5, 1.0, 2.5, 5.0, 10.0, np.inf)
 # Share of the expected coverage below which a surface is of another place or upside down, not only too sure.
 _POOR = 0.5
 # Largest number of values of a raster of classes.
@@ -51,7 +51,7 @@ def evaluate_surface(
     if the reference was moved. ``classes`` is a raster of whole numbers, such as land cover.
 
     Returns figures of `Accuracy.report` for ``all`` heights, ``before`` registration, by ``slope`` of the reference
-    (degrees), ``width`` of the interval (metres) and ``classes``; ``registration``, see `Registration.report`;
+    (degrees), ``half_width`` of the interval (metres) and ``classes``; ``registration``, see `Registration.report`;
     ``nominal``, the level of the intervals, and what it is (``nominal_is``): ``coverage``, ``alpha``, or None.
     """
     given = open_comparison(surface, reference)
@@ -62,13 +62,13 @@ def evaluate_surface(
         read_place(Path(classes))
     moved, warnings = registered(given) if registers else (given, [])
     before, whole = Accuracy(nominal), Accuracy(nominal)
-    slopes, widths = _Ranges(SLOPES, nominal), _Ranges(WIDTHS, nominal)
+    slopes, halves = _Ranges(SLOPES, nominal), _Ranges(HALF_WIDTHS, nominal)
     kinds: dict[int, Accuracy] = {}
     for window in tiles(given):
         cells, known = compared(moved, window)
         whole.add(cells)
         slopes.add(cells, _slope(moved, window)[known])
-        widths.add(cells, cells.width)
+        halves.add(cells, cells.width / 2)
         if classes is not None:
             for number, chosen in _classes(given, Path(classes), window, known):
                 kinds.setdefault(number, Accuracy(nominal)).add(cells.of(chosen))
@@ -91,7 +91,7 @@ def evaluate_surface(
         "before": in_place,
         "all": report,
         "slope": slopes.report(),
-        "width": widths.report(),
+        "half_width": halves.report(),
         "classes": [{"class": number, **kinds[number].report()} for number in sorted(kinds)],
     }
 

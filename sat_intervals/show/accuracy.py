@@ -27,9 +27,9 @@ _WORTH, _LONGEST = 50, 900
 
 
 def draw_reliability(report: dict[str, Any], target: Path, name: str, dpi: int = DPI) -> None:
-    """Draw the half widths of intervals against those that would have been needed, and coverage, by class of width."""
+    """Draw the half widths of intervals against those that would have been needed, and coverage, by class of them."""
     nominal = report["nominal"]
-    kinds = [kind for kind in report["width"] if kind["with_interval"] >= _WORTH]
+    kinds = [kind for kind in report["half_width"] if kind["with_interval"] >= _WORTH]
     with page(target, (9.0, 4.2), dpi, f"{name}: intervals and reference") as figure:
         left, right = figure.subplots(1, 2)
         stated = [kind["mean_half_width"] for kind in kinds]
@@ -47,7 +47,7 @@ def draw_reliability(report: dict[str, Any], target: Path, name: str, dpi: int =
         right.bar(range(len(kinds)), [kind["coverage"] for kind in kinds], color=BLUE, width=0.7)
         right.axhline(report["all"]["coverage"] or 0.0, color=ORANGE, lw=1, label="measured, all cells")
         right.set_xticks(range(len(kinds)), [_limits(kind) for kind in kinds], fontsize=8)
-        right.set(xlabel="width of the interval (m)", ylabel="share of reference heights inside", ylim=(0, 1.15))
+        right.set(xlabel="half width of the interval (m)", ylabel="share of reference heights inside", ylim=(0, 1.15))
         right.legend(loc="upper right", frameon=False, ncols=2)
         for place, kind in enumerate(kinds):
             right.text(place, 0.02, f"{kind['with_interval']:,}", ha="center", fontsize=7, color="white", rotation=90)

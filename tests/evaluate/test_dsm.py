@@ -34,9 +34,9 @@ def test_evaluate_surface__worked_example(tmp_path):
     assert (everything["bias"], everything["median"]) == (pytest.approx(1.375), pytest.approx(1.25))
     assert everything["nmad"] == pytest.approx(1.4826 * 0.75)
     assert {kind["from"]: kind["count"] for kind in report["slope"]} == {0: 1, 5: 0, 15: 2, 30: 0, 45: 1}
-    assert {kind["from"]: kind["count"] for kind in report["width"]} == {0: 0, 1: 1, 2: 3, 5: 0, 10: 0, 20: 0}
-    assert {key: report["width"][1][key] for key in ("from", "to", "count", "coverage", "median", "le90")} == {
-        "from": 1.0, "to": 2.0, "count": 1, "coverage": 0.0, "median": -1.0, "le90": 1.0
+    assert {kind["from"]: kind["count"] for kind in report["half_width"]} == {0: 0, 0.5: 1, 1: 3, 2.5: 0, 5: 0, 10: 0}
+    assert {key: report["half_width"][1][key] for key in ("from", "to", "count", "coverage", "median", "le90")} == {
+        "from": 0.5, "to": 1.0, "count": 1, "coverage": 0.0, "median": -1.0, "le90": 1.0
     }  # fmt: skip
     # Squares 1 .25 4 16; of .5 1 2 4 the rank 2.7 for LE90; of -1 .5 2 4 the ranks .15 and 2.85. Missed by 0.5 and
     # 3 m; with a nominal coverage of .9 each counts twenty times: (9.5 + 20 x 3.5) / 4.
@@ -250,21 +250,23 @@ def test_evaluate_command__writes_figures_and_pictures(tmp_path):
     truth = relief(row, column)
     model = write_surface(tmp_path / "dsm.tif", truth + 0.1, truth - 0.5, truth + 0.5)
     words = "evaluate", "--dsm", model, "--reference", write_raster(tmp_path / "reference.tif", [truth])
-    result = invoke(*words, "--pictures", tmp_path, "--no-register")
+    folder = tmp_path / "new" / "pictures"
+    result = invoke(*words, "--pictures", folder, "--no-register")
     assert result.exit_code == 0, result.output
-    written = [tmp_path / f"dsm-{name}" for name in ("accuracy.json", "accuracy.md", "reliability.png", "errors.png",
+    written = [folder / f"dsm-{name}" for name in ("accuracy.json", "accuracy.md", "reliability.png", "errors.png",
                                                      "profile.png")]  # fmt: skip
     assert result.stdout.splitlines()[-5:] == [str(path) for path in written]
     assert json.loads(written[0].read_text())["all"]["median"] == pytest.approx(0.1)
     assert "| all cells | 4200 | 0.100 |" in written[1].read_text()
     assert all(path.stat().st_size > 5000 for path in written[2:])
-    refused = invoke(*words, "--pictures", tmp_path)
+    refused = invoke(*words, "--pictures", folder)
     assert (refused.exit_code, refused.stdout) == (2, "")
     assert f"{written[0]} exists: choose another name or --overwrite" in refused.stderr
-    again = invoke(*words, "--pictures", tmp_path, "--quiet", "--overwrite")
+    again = invoke(*words, "--pictures", folder, "--quiet", "--overwrite")
     assert again.exit_code == 0
     assert "all cells" in again.stdout
     assert "dsm-accuracy" not in again.stdout
+    assert "dsm.tif is not a folder: choose another name" in invoke(*words, "--pictures", model).stderr
     for line, message in (((0, 0, 1, 1), "does not cross"), ((PLACE.c, PLACE.f, PLACE.c + 70, PLACE.f - 60), "")):
         result = invoke(*words, "--pictures", tmp_path, "--overwrite", "--line", *line)
         assert result.exit_code == (2 if message else 0)
