@@ -16,6 +16,8 @@ from pydantic.dataclasses import dataclass
 from typing_extensions import TypedDict
 
 from sat_intervals.config.files import load_yaml, set_by_name
+from sat_intervals.config.settings import Config
+from sat_intervals.config.wording import known
 from sat_intervals.errors import SatIntervalsError
 
 _FILES = ("left.tif", "right.tif", "truth.tif", "meta.json")
@@ -85,6 +87,9 @@ class PairOfBatch:
     window: _WINDOW | None = None
     sensors: tuple[str, ...] | None = None
     resolution: float | None = None
+
+
+_OF_BATCH = ("name", *_IMAGES, "minimum", "maximum", *Reading.__annotations__, "window", *_SENSORS, "resolution")
 
 
 def is_pair(path: Path) -> bool:
@@ -190,6 +195,9 @@ def _checked(place: str, kind: type[Any], values: dict[str, Any]) -> Any:
 
 
 def _of_batch(place: str, row: dict[str, Any], file: Path) -> PairOfBatch:
+    columns = (*_OF_BATCH, *Config.model_fields)
+    if unknown := [str(key) for key in row if str(key).split(".")[0] not in columns]:
+        raise SatIntervalsError(f"{place}: unknown column {unknown[0]!r}{known(unknown[0], columns)}")
     name = str(row.pop("name"))
     if "cluster" in (str(key).split(".")[0] for key in row):
         raise SatIntervalsError(f"{place}: all pairs share one cluster: set it with --config or --cluster")

@@ -215,6 +215,7 @@ def test_match_jobs__yields_a_job_once_when_nothing_of_it_is_under_way(images, t
         ("a.csv", "name,left,right,sgm.p2,sgm\nx,l,r,3,null\n", "sgm is 'null': parts of sgm are also given"),
         ("a.csv", "name,left,right,sgm.p2,sgm.p2\nx,l,r,1,2\n", "column sgm.p2 appears twice"),
         ("a.csv", "name,left,right,cluster.kind\nx,l,r,slurm\n", "row 1: all pairs share one cluster"),
+        ("a.csv", "name,left,right,band_right\nx,l,r,2\n", r"row 1: unknown column 'band_right', .*right_band.*, sgm"),
         ("a.csv", 'name,left,right\n"x\ny",l,r\n', r"row 1: name 'x\\ny' cannot be"),
         ("a.yaml", "- {name: x, left: l, left: m, right: r}", "key 'left' appears twice"),
         ("a.yaml", "- {name: 2024-13-45, left: l, right: r}", "cannot be read"),
