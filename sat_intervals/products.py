@@ -48,7 +48,7 @@ FLAGS = (
     Flag(0, "left_window", "the left window meets the image's border, no data or a mask", True),
     Flag(1, "no_candidate", "all candidates impossible: outside the right image or on its no data", True),
     Flag(2, "range_incomplete", "part of the search range could not be searched", False),
-    Flag(3, "not_refined", "V-fit not done", False),
+    Flag(3, "not_refined", "disparity without sub-pixel refinement", False),
     Flag(6, "left_masked", "the left pixel is masked", True),
     Flag(7, "right_masked", "all candidates impossible, at least one through the right mask", True),
     Flag(8, "occlusion", "rejected by cross-checking: occlusion", True),

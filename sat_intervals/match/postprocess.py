@@ -21,6 +21,7 @@ from sat_intervals.products import (
     BOUND_STEPS,
     INVALID,
     NO_DISPARITY,
+    NOT_REFINED,
     OPEN_ABOVE,
     OPEN_BELOW,
     RANGE_END,
@@ -140,6 +141,7 @@ def filter_rows(rows: RawRows, scale: ConfidenceScale, config: Config) -> Filter
     deviation = _EMPTY
     if config.fits:
         disparity, deviation = refined(disparity, kept, rows.left, rows.right, config)
+        validity[np.isfinite(deviation)] &= ~np.uint16(NOT_REFINED)
     written = searched if config.products.keep_rejected else kept
     return Filtered(disparity, lower, upper, confidence, validity, low, written, deviation)
 

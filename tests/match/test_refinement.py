@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from sat_intervals import load_config, match_arrays
 from sat_intervals.match.refinement import Refined, bounds_of_both, pixel_windows, pixels_of, refined
 from sat_intervals.match.whole import cut, whole_view
-from sat_intervals.products import INVALID, REGULARIZED
+from sat_intervals.products import INVALID, NOT_REFINED, REGULARIZED
 from sat_intervals.tiling import Window
 
 SEARCH = {"minimum": -4, "maximum": 12}
@@ -71,6 +71,20 @@ def test_match_arrays__of_a_range_too_short_stays_inside_it():
         assert found.disparity.values[valid].max() <= 4
         assert found.upper.values[valid].max() <= 4.5
         assert found.lower.values[valid].min() >= -0.5
+
+
+@pytest.mark.parametrize("method", ["vfit", "least_squares"])
+def test_validity__bit_3_is_of_pixels_that_neither_refinement_has_moved(method):
+    """The true shift is next to the minimum, where V-fit has only one side."""
+    settings = {"preset": "satellite", "disparity": {"minimum": 3, "maximum": 8}, "refinement": {"method": method}}
+    found = match_arrays(*pair(), settings | {"interval": {"alpha": 0.9}, "products": {"sigma": method != "vfit"}})
+    valid = found.validity.values & INVALID == 0
+    without = (found.validity.values & NOT_REFINED != 0)[valid]
+    if method == "vfit":
+        assert without.mean() > 0.5
+    else:
+        assert not without[np.isfinite(found.sigma.values[valid])].any()
+        assert without.mean() < 0.2
 
 
 def test_bounds_of_both__worked_example():
