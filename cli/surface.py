@@ -66,14 +66,14 @@ def surface(
     config = settings.load()
     with Console(run.quiet or as_json) as console:
         from sat_intervals.config import resolved
-        from sat_intervals.heights.sensors import Sensors
+        from sat_intervals.heights.dsm import check_sensors
 
         _check(cells, resolved(config).interval)
         raw |= {"geoid": cells["geoid"] if raw["dem"] else None}
         given, images = sensor_files[0] if sensor_files else (), pair.files
         pair, files, doubts = _epipolar(pair, given, raw, out, console, overwrite=run.overwrite)
         _check_kept(out, cells, [*files, *images], settings.file)
-        Sensors.load(*map(Path, files))  # raises before hours of matching
+        check_sensors(files, cells["resolution"], cells["crs"])
         left, right = pair.open()
         report = run.match(left, right, out, config, window=pair.window, progress=console.progress)
         made = _surface(out, files, cells, console)
@@ -167,7 +167,8 @@ def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -
     cells = {"crs": None, "radius": None, "geoid": None, "choices": SurfaceChoices()}
     errors: dict[str, SatIntervalsError] = {}
     if any(pair.resolution for pair in pairs):
-        from sat_intervals.heights.sensors import Sensors  # without its extra it raises, for all pairs
+        import sat_intervals.heights.sensors  # noqa: F401 (without its extra it raises, for all pairs)
+        from sat_intervals.heights.dsm import check_sensors
     _check_kept_by_all(pairs, out)
     for pair in pairs:
         if not pair.resolution:
@@ -177,7 +178,7 @@ def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -
         try:
             _check(of_pair, None)
             if pair.sensors and _has_grids(pair):
-                Sensors.load(*map(Path, pair.sensors))
+                check_sensors(pair.sensors, pair.resolution, None)
         except SatIntervalsError as error:
             errors[pair.name] = error
             click.echo(f"{pair.name}: there will be no surface: {error}", err=True)
@@ -204,6 +205,8 @@ def epipolar_pairs(out: Path, console: "Console", doubts: list[str], *, overwrit
     def epipolar(pair: "PairOfBatch") -> "PairOfBatch":
         if not pair.resolution or _has_grids(pair):
             return pair
+        from sat_intervals.heights.dsm import check_sensors
+
         kinds = (
             (pair.reading.get(f"{side}_{what}", pair.reading.get(what)) for side in ("left", "right"))
             for what in ("nodata", "band")
@@ -215,6 +218,7 @@ def epipolar_pairs(out: Path, console: "Console", doubts: list[str], *, overwrit
         given = tuple(map(Path, pair.sensors or ()))
         made, files, found = _epipolar(images, given, raw, out / pair.name, console, overwrite=overwrite)
         doubts.extend(found)
+        check_sensors(files, pair.resolution, None)
         left, right = made.images
         masks = dict(zip(("left_mask", "right_mask"), made.masks, strict=True))
         reading = pair.reading if made is images else {}

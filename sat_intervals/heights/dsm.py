@@ -5,12 +5,14 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sat_intervals.config import Calibration, Interval, surface_key
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.cells import Tally, strips
 from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.geometry import FILE, Geometry, geometry_of
-from sat_intervals.heights.lattice import joined, on_map
+from sat_intervals.heights.lattice import Ground, joined, on_map
 from sat_intervals.heights.point_cloud import Cells, PointCloud
 from sat_intervals.machine import usable_cores
 from sat_intervals.progress import Progress
@@ -162,6 +164,26 @@ def checked_cells(
             f"{_REACH * resolution:g} m, or a coarser --resolution"
         )
     return grid, resolution, crs, radius
+
+
+def check_sensors(files: Sequence[str | Path], resolution: float | Path, crs: str | None) -> None:
+    """Raise before hours of matching if models and grids cannot be read, or pixels in the middle have too many cells."""
+    from sat_intervals.heights.sensors import Sensors, lattice_of
+
+    left_model, right_model, left_grid, right_grid = map(Path, files)
+    sensors = Sensors.load(left_model, right_model, left_grid, right_grid)
+    if isinstance(resolution, Path):
+        return
+    column, row = (int(nodes[nodes.size // 2]) for nodes in sensors.left_grid.points)
+    lattice = lattice_of(sensors, Window(row, column, 2, 2), 0, 1)
+    if not np.isfinite(lattice.nodes).all():
+        return
+    area = Ground(on_map(lattice, Projection(crs or utm_of(*lattice.middle)), "the pair")).pixel_area
+    if 2 * area > _CELLS_PER_PIXEL * resolution**2:  # the box around all cells may be twice as large as the image
+        raise SatIntervalsError(
+            f"{area / resolution**2:.0f} cells of {resolution:g} m for each pixel of {area**0.5:.2g} m: choose a "
+            "coarser --resolution"
+        )
 
 
 def surface_tags(

@@ -528,6 +528,15 @@ def test_surface__of_raw_images_has_the_heights_of_the_scene_and_later_commands_
     refused(["dsm", run, *SETTINGS], "left.tif was rectified again")
 
 
+def test_surface__a_resolution_far_below_the_pixels_is_refused_before_matching(made, raw, tmp_path):
+    images = made / "left.tif", made / "right.tif"
+    refused(["surface", *images, tmp_path / "run", "--resolution", 0.02], "cells of 0.02 m for each pixel", "coarser")
+    row = {"name": "a", "left": str(raw[0]), "right": str(raw[1]), "resolution": 0.015}
+    (tmp_path / "pairs.json").write_text(json.dumps([row]))
+    assert "cells of 0.015 m" in invoke("batch", tmp_path / "pairs.json", tmp_path).stderr
+    assert not list(tmp_path.rglob("intervals.tif")) + list(tmp_path.rglob("tiles"))
+
+
 def test_surface__of_a_model_that_is_off_recovers_the_rows_or_ends_with_one_line(scene, tmp_path):
     from raw import TURNS, raw_pair
 
