@@ -46,11 +46,6 @@ def _folder() -> str:
     return str(folder) if os.access(folder, os.W_OK) else ""
 
 
-def none_is_cached() -> bool:
-    """Return whether there is a cache folder, and no machine code in it yet."""
-    return bool(_folder()) and not any(Path(_folder()).rglob("*.nbi"))
-
-
 @contextmanager
 def _own_folder() -> Iterator[None]:
     """Cache what is decorated in the block in our folder. numba reads it from a global that applies to all packages."""

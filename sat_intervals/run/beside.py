@@ -1,12 +1,13 @@
-"""Compilation of kernels beside a command, the first on a machine: numba uses one core of a process."""
+"""Compilation of kernels beside a command, the first of an installation: numba uses one core of a process."""
 
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from sat_intervals.config import Config
-from sat_intervals.kernels.compiled import none_is_cached
+from sat_intervals.kernels.disparity import median
 
 _COMPILE = """
 import sys
@@ -18,8 +19,12 @@ compile_postprocessing(Config.model_validate_json(sys.argv[1]))
 
 @contextmanager
 def compiled_beside(config: Config) -> Iterator[None]:
-    """On a machine without compiled kernels, let a second process compile those after matching while the block runs."""
-    if not none_is_cached():
+    """Without compiled kernels, let a second process compile those after matching while the block runs.
+
+    numba keeps those of each folder of the package apart, and in other folders those of other packages.
+    """
+    cache = median.stats.cache_path
+    if cache is None or any(Path(cache).glob("*.nbi")):
         yield
         return
     any_range = config.disparity.model_copy(update={"minimum": 0, "maximum": 3})
