@@ -27,8 +27,8 @@ _AT_ENDS, _AT_END = 0.005, 0.001
 _ROWS = 8
 # Share of windows that meet no data from which it is asked if it is isolated, and of valid pixels that are few.
 _SPOILED, _FEW = 0.2, 0.2
-# Times the usual width of intervals that are wide.
-_WIDE = 2.0
+# Times the usual width of intervals that are wide, and of those that a run warns of.
+_WIDE, _TOO_WIDE = 2.0, 5.0
 # Rows that make a pair badly resampled, and the distance of matches that makes it noisy.
 _ROW_OFFSET, _NOISE = 1.0, 0.55
 
@@ -125,7 +125,8 @@ def warnings_of(job: Job, counts: Mapping[str, Any], quality: Mapping[str, Any])
         of_pair = _rejected(counts, paths) or ([] if was_found else of_range) or [*rows, *of_range]
     noise = noise_line(survey, paths) if config.cost.method == "census" and config.preset == "paper" else []
     missed = unreached(config)
-    return [*of_data, *of_pair, *noise, *([f"{paths[0]}: {missed}"] if missed else [])]
+    wide = [] if of_data or of_pair else _doubts_of_width(counts, config, paths)
+    return [*of_data, *of_pair, *noise, *wide, *([f"{paths[0]}: {missed}"] if missed else [])]
 
 
 def _spoiled(job: Job, counts: Mapping[str, Any], no_data: float) -> list[str]:
@@ -163,6 +164,18 @@ def _doubts_of_range(counts: Mapping[str, Any], search: Disparity, path: str, *,
             "or the ground has no texture"
         ]
     return []
+
+
+def _doubts_of_width(counts: Mapping[str, Any], config: Config, paths: tuple[str, str]) -> list[str]:
+    """Return a warning if intervals are far wider than usual: the images have little in common, or no texture."""
+    width, usual = counts["median_interval_width"], _usual_width(config)
+    if width is None or usual is None or width <= _TOO_WIDE * usual:
+        return []
+    way_out = "other dates" if config.cost.method == "mccnn" else "--preset satellite-mccnn, or other dates"
+    return [
+        f"{paths[0]} and {paths[1]}: the median interval is {width:.1f} px wide, {usual:.1f} px on the calibration's "
+        f"pairs: the images have little texture, or differ, as of dates before and after a change: try {way_out}"
+    ]
 
 
 def verdict_of(counts: Mapping[str, Any], config: Config, warnings: Sequence[str]) -> str:

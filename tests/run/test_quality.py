@@ -100,6 +100,19 @@ def test_warnings_of__isolated_pixels_without_data(scene, tmp_path):
     assert "of the pixels are no data or masked, but spoil the windows of" in report["warnings"][0]
 
 
+def test_warnings_of__images_that_have_little_in_common(scene, tmp_path):
+    """As of dates before and after a change: cross-checking keeps most of it, with intervals as wide as the range."""
+    other = make_scene(260, 330, seed=8).left[:, : scene.right.shape[1]]
+    for own, count in ((0.7, 0), (0.25, 1)):
+        images = [tmp_path / f"{side}{count}.tif" for side in ("left", "right")]
+        for image, pixels in zip(images, (scene.left, own * scene.right + (1 - own) * other), strict=True):
+            write_layer(image, pixels.astype(np.uint16), 0, PLACE)
+        settings = {"disparity": {"minimum": scene.minimum, "maximum": scene.maximum}, "rows": "none"}
+        report = match_pair(*images, tmp_path / str(count), settings)
+        assert report["counts"]["valid"] > 0.5 * report["counts"]["pixels"]
+        assert ["the median interval is" in line for line in report["warnings"]] == [True] * count
+
+
 @pytest.mark.parametrize("search", [(-180, -110), (90, 150), (-120, -60), (40, 80)])
 def test_match__a_range_beside_the_truth_is_the_one_diagnosis(tmp_path, search):
     """Rows are wrong, too, but the range is named, and the one to give."""
