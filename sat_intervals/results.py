@@ -15,6 +15,7 @@ from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.kernels.rows import RowOffsets
 from sat_intervals.products import BANDS, Bands
 from sat_intervals.raster import Georeferencing, Image, check_not_replaced, open_image, read_layers, read_tags
+from sat_intervals.raster.identity import absolute_in
 from sat_intervals.raster.images import opened
 from sat_intervals.raster.published import is_surface_of, tags_beside
 from sat_intervals.raster.windows import Layer, read_small_image, read_small_layers
@@ -162,6 +163,7 @@ def open_run(out: str | Path) -> Run:
     try:
         report = json.loads(file.read_bytes())
         region = Window(**report["tiles"]["region"])
+        report["inputs"] = absolute_in(file.parent, report["inputs"])
         config = load_config(report["settings"])
     except OSError as error:
         raise SatIntervalsError(f"{file}: {error.strerror}: give the folder of a finished run") from error

@@ -12,7 +12,7 @@ from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.heights.lattice import Lattice
 from sat_intervals.heights.rectified import rectified_files
 from sat_intervals.progress import Progress
-from sat_intervals.raster.identity import identity
+from sat_intervals.raster.identity import absolute_in, identity, relative_in
 from sat_intervals.raster.publishing import write_record
 from sat_intervals.results import Run, open_run
 
@@ -67,7 +67,7 @@ def set_geometry(
     _, report = _sensors(run, paths)
     known = {kind: identity(str(path)) for kind, path in zip(_KINDS, paths, strict=True)}
     record = {"software": "sat-intervals", "images": _images(run)} | known
-    write_record(run.out / FILE, record)
+    write_record(run.out / FILE, relative_in(run.out, record))
     return report
 
 
@@ -116,7 +116,7 @@ def _noted(run: Run) -> list[Path]:
     """Return the files that ``geometry.json`` names; raise if there are none, or they are not those that it means."""
     file = run.out / FILE
     try:
-        record = json.loads(file.read_bytes())
+        record = absolute_in(run.out, json.loads(file.read_bytes()))
         images, known = record["images"], [record[kind] for kind in _KINDS]
         paths = [str(one["path"]) for one in known]
     except FileNotFoundError as error:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.raster.identity import absolute_in
 
 FILE = "rectify.json"
 IMAGES = "left.tif", "right.tif"
@@ -14,7 +15,7 @@ GRIDS = "left_grid.tif", "right_grid.tif"
 def read_record(folder: Path) -> dict[str, Any] | None:
     """Read the record of a folder; None if there is none, or another file of this name."""
     try:
-        record = json.loads((folder / FILE).read_bytes())
+        record = absolute_in(folder, json.loads((folder / FILE).read_bytes()))
         return record if record.keys() >= {"inputs", "settings", "finished"} else None
     except (FileNotFoundError, NotADirectoryError, ValueError, AttributeError):
         return None

@@ -14,7 +14,7 @@ from sat_intervals.heights.rectified import FILE, GRIDS, IMAGES, read_record, re
 from sat_intervals.products import Band, plain
 from sat_intervals.progress import Progress
 from sat_intervals.raster import File, Georeferencing, Image, OutputWriter, check_not_replaced, describe
-from sat_intervals.raster.identity import identity
+from sat_intervals.raster.identity import identity, relative_in
 from sat_intervals.raster.publishing import check_free, write_record
 from sat_intervals.results import paths_of
 from sat_intervals.store.lock import locked
@@ -107,7 +107,7 @@ def _make(
 
 
 def _note(out: Path, record: dict[str, Any]) -> None:
-    write_record(out / FILE, record)
+    write_record(out / FILE, relative_in(out, record))
 
 
 def _asked(pair: RawPair, left: "SensorImage", right: "SensorImage", known: dict[str, Any]) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 import hashlib
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from http.client import HTTPException
 from pathlib import Path
@@ -44,6 +44,24 @@ def identity(path: str, known: Mapping[str, Mapping[str, Any]] | None = None) ->
     if not _NO_PATH.match(path):
         raise ChangedInputError(f"{path} cannot be read: it is missing, a folder, or a link to nothing: restore it")
     return {"path": path}
+
+
+def relative_in(folder: Path, record: Any) -> Any:
+    """Return a record of identities; paths inside a folder become relative, ``./left.tif``: the folder may be moved."""
+    inside = os.path.join(os.path.realpath(folder), "")
+    return _with_paths(record, lambda path: f"./{path.removeprefix(inside)}" if path.startswith(inside) else path)
+
+
+def absolute_in(folder: Path, record: Any) -> Any:
+    """Return a record of `relative_in` for the place where its folder is now."""
+    here = os.path.realpath(folder)
+    return _with_paths(record, lambda path: os.path.join(here, path[2:]) if path.startswith("./") else path)
+
+
+def _with_paths(record: Any, changed: Callable[[str], str]) -> Any:
+    if isinstance(record, dict):
+        return {key: changed(one) if key == "path" else _with_paths(one, changed) for key, one in record.items()}
+    return [_with_paths(one, changed) for one in record] if isinstance(record, list) else record
 
 
 def local_file(path: str) -> Path | None:

@@ -16,6 +16,7 @@ from sat_intervals.match.postprocess import ConfidenceScale, confidence_scale
 from sat_intervals.products import as_json
 from sat_intervals.progress import Progress, logged_stage
 from sat_intervals.raster import OutputError, OutputWriter, Part
+from sat_intervals.raster.identity import absolute_in
 from sat_intervals.raster.publishing import new_file
 from sat_intervals.run.inputs import check_unchanged
 from sat_intervals.run.job import Job, remove_tiles
@@ -55,12 +56,12 @@ def assemble(job: Job, workers: Workers, seconds: dict[str, float], progress: Pr
             _copy_parts(job, writer, parts, workers, progress)
             made = writer.build()
         with logged_stage(seconds, "inputs"):
-            check_unchanged(job.inputs, job.left, job.right, job.config)
+            check_unchanged(absolute_in(job.out, job.inputs), job.left, job.right, job.config)
         report = report_of(job, tables, scale, parts.values(), seconds)
         for line in report["warnings"]:
             _WARNINGS.warning("%s", line)
         _publish(job, writer, made, report)
-    return report
+    return report | {"inputs": absolute_in(job.out, job.inputs)}
 
 
 def _publish(job: Job, writer: OutputWriter, made: Mapping[str, Path], report: dict[str, Any]) -> None:

@@ -23,7 +23,7 @@ from sat_intervals.raster import (
     files_of,
     part_bytes,
 )
-from sat_intervals.raster.identity import check_not_replaced
+from sat_intervals.raster.identity import absolute_in, check_not_replaced, relative_in
 from sat_intervals.run.checks import check_tiles, checked_pair, checked_region, fitted_to_jobs
 from sat_intervals.run.inputs import describe_inputs, identities
 from sat_intervals.run.state import OUTPUTS, check_folder, files_of_run, next_step, read_report
@@ -77,7 +77,7 @@ class Job:
 
     @property
     def inputs(self) -> dict[str, Any]:
-        """Return the inputs as `describe_inputs` does."""
+        """Return the inputs as `describe_inputs` does, with paths inside ``out`` relative to it."""
         return dict(self.manifest["inputs"])
 
     @property
@@ -193,8 +193,8 @@ def open_job(
     before: dict[str, Any] = {}  # manifest or report of an earlier run
     with suppress(StoreError):
         before = read_manifest(home_of(out)) or read_report(out) or {}
-    inputs = describe_inputs(*images, config, identities(before.get("inputs", {})))
-    known = _known(out, before, inputs)
+    inputs = describe_inputs(*images, config, identities(absolute_in(out, before.get("inputs", {}))))
+    known = _known(out, before, relative_in(out, inputs))
     prepared = prepare(FilePair(*images), config, each or here, region=window, known=known, looks=each is not None)
     return job_of(prepared, out, inputs, requested, region, overwrite=overwrite, pair=pair)
 
@@ -214,7 +214,7 @@ def job_of(
     check_tiles(config, region)
     prepared = replace(prepared, config=config)
     read = [*identities(inputs), *(files_of(config.disparity.grid) if config.disparity.grid else ())]
-    manifest = _manifest(prepared, inputs, region)
+    manifest = _manifest(prepared, relative_in(out, inputs), region)
     run, store, home = digest(manifest), config.cluster.store, folder_at(home_of(out))
     folder = folder_at(f"{folder_at(store)}/{'-'.join(filter(None, (pair, run)))}" if store else home_of(out))
     manifest[PLACE] = None if folder == home else str(folder)

@@ -528,6 +528,23 @@ def test_surface__of_raw_images_has_the_heights_of_the_scene_and_later_commands_
     refused(["dsm", run, *SETTINGS], "left.tif was rectified again")
 
 
+def test_surface__in_a_folder_that_was_moved_serves_later_commands(made, tmp_path):
+    before, out = tmp_path / "before", tmp_path / "out"
+    shutil.copytree(made, before)
+    result = invoke("surface", before / "left.tif", before / "right.tif", before, *SETTINGS)
+    assert result.exit_code == 0, result.output
+    for name in ("run.json", "geometry.json", "rectify.json"):
+        assert str(before) not in (before / name).read_text()
+    surface = (before / "dsm.tif").read_bytes()
+    shutil.move(before, out)
+    for words in (["dsm", out, *SETTINGS, "--overwrite"], ["report", out], ["project", out], ["stac", out]):
+        result = invoke(*words)
+        assert result.exit_code == 0, result.output
+    assert (out / "dsm.tif").read_bytes() == surface
+    again = invoke("surface", out / "left.tif", out / "right.tif", out, *SETTINGS)
+    assert "was already complete" in again.stderr
+
+
 def test_surface__a_resolution_far_below_the_pixels_is_refused_before_matching(made, raw, tmp_path):
     images = made / "left.tif", made / "right.tif"
     refused(["surface", *images, tmp_path / "run", "--resolution", 0.02], "cells of 0.02 m for each pixel", "coarser")
