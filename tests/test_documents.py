@@ -55,6 +55,15 @@ def test_readme__is_short() -> None:
     assert long == []
 
 
+def test_readme__begins_with_commands_that_work_without_an_environment() -> None:
+    first = [line.partition("  #")[0].rstrip() for line in next(blocks(ROOT / "README.md", "")).splitlines()]
+    assert first[:2] == ["make demo", ". .venv/bin/activate"]
+    assert "make test" in first
+    assert all(re.search(rf"^{name}: ", (ROOT / "Makefile").read_text(), re.MULTILINE) for name in ("demo", "test"))
+    steps = (ROOT / ".ci" / "run").read_text()
+    assert steps.index('make -C "$scratch/clone" test\n') < steps.index("make VENV=")
+
+
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda file: file.name)
 def test_links__lead_to_files_and_headings(document: Path) -> None:
     for link in re.findall(r"\]\(([^)\s]+)\)", document.read_text()):
