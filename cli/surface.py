@@ -219,9 +219,8 @@ def epipolar_pairs(out: Path, console: "Console", doubts: list[str], *, overwrit
         made, files, found = _epipolar(images, given, raw, out / pair.name, console, overwrite=overwrite)
         doubts.extend(found)
         check_sensors(files, pair.resolution, None)
-        left, right = made.images
-        masks = dict(zip(("left_mask", "right_mask"), made.masks, strict=True))
+        names = dict(zip(("left", "right", "left_mask", "right_mask"), (*made.images, *made.masks), strict=True))
         reading = pair.reading if made is images else {}
-        return replace(pair, left=left, right=right, **masks, reading=reading, sensors=tuple(map(str, files)))
+        return replace(pair, **names, reading=reading, sensors=tuple(map(str, files)))
 
     return epipolar

@@ -15,7 +15,7 @@ from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.kernels.rows import RowOffsets
 from sat_intervals.products import BANDS, Bands
 from sat_intervals.raster import Georeferencing, Image, check_not_replaced, open_image, read_layers, read_tags
-from sat_intervals.raster.identity import absolute_in
+from sat_intervals.raster.identity import absolute_in, identities
 from sat_intervals.raster.images import opened
 from sat_intervals.raster.published import is_surface_of, tags_beside
 from sat_intervals.raster.windows import Layer, read_small_image, read_small_layers
@@ -86,7 +86,7 @@ class Run:
         grid = self.config.disparity.grid  # other rasters are inputs
         truth = self.truth_beside
         given = None if truth.exists() and "REFERENCE" in read_tags(truth) else truth  # `reference` may replace its own
-        check_not_replaced([*own, *paths_of(self.report["inputs"]), grid, given, *inputs], outputs)
+        check_not_replaced([*own, *identities(self.report["inputs"]), grid, given, *inputs], outputs)
 
     def layer(self, path: str | Path) -> Layer:
         """Open another raster of the same pixels, such as the truth."""
@@ -175,14 +175,6 @@ def open_run(out: str | Path) -> Run:
         check_file(file.with_name(name), "give the folder of a finished run, or match with --overwrite")
     with opened(str(file.with_name("validity.tif"))) as dataset:
         return Run(file.parent, report, config, region, Georeferencing.of(dataset))
-
-
-def paths_of(inputs: Any) -> Iterator[str]:
-    """Yield the paths of all files in the section ``inputs`` of a report, at any depth."""
-    for value in inputs.values() if isinstance(inputs, dict) else inputs if isinstance(inputs, list) else ():
-        yield from paths_of(value)
-    if isinstance(inputs, dict) and "path" in inputs:
-        yield inputs["path"]
 
 
 def open_results(out: str | Path, truth: str | Path | None = None) -> Results:

@@ -70,7 +70,7 @@ def evaluate_run(
         raise SatIntervalsError(f"{out} has no intervals, its setting interval is null: run match with intervals")
     if truth is None and not run.truth_beside.exists():
         left = run.report["inputs"]["left"]["path"]
-        raise SatIntervalsError(f"{run.out}: there is no truth.tif beside its left image {left}: give --truth")
+        raise SatIntervalsError(f"{run.out}: there is no truth.tif beside its left image {left}: give a truth")
     strips = partial(_read_strips, run, run.layer(truth or run.truth_beside), None if mask is None else run.layer(mask))
     criteria = criteria_of(config, tolerance)
     figures = evaluate(strips, criteria, remove_bias=remove_bias, with_rejected=config.products.keep_rejected)

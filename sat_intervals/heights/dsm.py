@@ -161,29 +161,24 @@ def checked_cells(
     if radius > _REACH * resolution:
         raise SatIntervalsError(
             f"radius is {radius:g} m, {radius / resolution:.0f} cells of {resolution:g} m: choose at most "
-            f"{_REACH * resolution:g} m, or a coarser --resolution"
+            f"{_REACH * resolution:g} m, or a coarser resolution"
         )
     return grid, resolution, crs, radius
 
 
 def check_sensors(files: Sequence[str | Path], resolution: float | Path, crs: str | None) -> None:
-    """Raise before hours of matching if models and grids cannot be read, or pixels in the middle have too many cells."""
+    """Raise before hours of matching if models or grids cannot be read, or pixels have too many cells."""
     from sat_intervals.heights.sensors import Sensors, lattice_of
 
-    left_model, right_model, left_grid, right_grid = map(Path, files)
-    sensors = Sensors.load(left_model, right_model, left_grid, right_grid)
-    if isinstance(resolution, Path):
-        return
+    sensors = Sensors.load(*map(Path, files))
     column, row = (int(nodes[nodes.size // 2]) for nodes in sensors.left_grid.points)
     lattice = lattice_of(sensors, Window(row, column, 2, 2), 0, 1)
-    if not np.isfinite(lattice.nodes).all():
+    if isinstance(resolution, Path) or not np.isfinite(lattice.nodes).all():
         return
-    area = Ground(on_map(lattice, Projection(crs or utm_of(*lattice.middle)), "the pair")).pixel_area
-    if 2 * area > _CELLS_PER_PIXEL * resolution**2:  # the box around all cells may be twice as large as the image
-        raise SatIntervalsError(
-            f"{area / resolution**2:.0f} cells of {resolution:g} m for each pixel of {area**0.5:.2g} m: choose a "
-            "coarser --resolution"
-        )
+    ground = Ground(on_map(lattice, Projection(crs or utm_of(*lattice.middle)), "the pair"))
+    count = ground.pixel_area / resolution**2
+    if 2 * count > _CELLS_PER_PIXEL:  # the box around all cells may be twice as large as the image
+        raise SatIntervalsError(f"{count:.0f} cells of {resolution:g} m for each pixel: choose a coarser resolution")
 
 
 def surface_tags(
@@ -251,6 +246,6 @@ def _cells(
     if cells.rows * cells.columns > _CELLS_PER_PIXEL * pixels:
         raise SatIntervalsError(
             f"{cells.rows} x {cells.columns} cells of {resolution:g} m for {pixels} pixels: "
-            "choose a coarser --resolution, or runs of one place"
+            "choose a coarser resolution, or runs of one place"
         )
     return cells

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 FILE = "geometry.json"
 _KINDS = "left_model", "right_model", "left_grid", "right_grid"
-_GIVE = "give --left-model, --right-model, --left-grid and --right-grid, for each OUT"
+_GIVE = "give left and right models and grids, for each OUT (--left-model, ...; in Python set_geometry)"
 
 
 @dataclass(frozen=True)

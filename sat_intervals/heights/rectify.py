@@ -14,9 +14,8 @@ from sat_intervals.heights.rectified import FILE, GRIDS, IMAGES, read_record, re
 from sat_intervals.products import Band, plain
 from sat_intervals.progress import Progress
 from sat_intervals.raster import File, Georeferencing, Image, OutputWriter, check_not_replaced, describe
-from sat_intervals.raster.identity import identity, relative_in
+from sat_intervals.raster.identity import identities, identity, relative_in
 from sat_intervals.raster.publishing import check_free, write_record
-from sat_intervals.results import paths_of
 from sat_intervals.store.lock import locked
 from sat_intervals.store.manifest import differences
 
@@ -112,7 +111,7 @@ def _note(out: Path, record: dict[str, Any]) -> None:
 
 def _asked(pair: RawPair, left: "SensorImage", right: "SensorImage", known: dict[str, Any]) -> dict[str, Any]:
     """Return inputs and settings, as ``rectify.json`` has them; ``known`` are earlier inputs."""
-    files = {file["path"]: file for one in known.values() for file in (one, *one.get("files", ()))}
+    files = identities(known)
     inputs = {
         "left": describe(pair.left, files),
         "right": describe(pair.right, files),
@@ -130,7 +129,7 @@ def _asked(pair: RawPair, left: "SensorImage", right: "SensorImage", known: dict
 def _is_needed(out: Path, asked: dict[str, Any], before: dict[str, Any], *, overwrite: bool) -> bool:
     """Return whether there is something to do; raise if files in the folder are not of this pair."""
     files = [out / name for name in (*IMAGES, *GRIDS)]
-    check_not_replaced(paths_of(asked["inputs"]), [*files, out / FILE])
+    check_not_replaced(identities(asked["inputs"]), [*files, out / FILE])
     is_finished = bool(before.get("finished"))
     changes = list(differences({name: before.get(name) for name in asked}, asked)) if is_finished else []
     if is_finished and not changes and all(file.exists() for file in files):

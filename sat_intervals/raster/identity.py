@@ -46,6 +46,13 @@ def identity(path: str, known: Mapping[str, Mapping[str, Any]] | None = None) ->
     return {"path": path}
 
 
+def identities(record: Any) -> dict[str, dict[str, Any]]:
+    """Return the identities in a record, at any depth, by path."""
+    parts = record.values() if isinstance(record, dict) else record if isinstance(record, list) else ()
+    found = {path: one for part in parts for path, one in identities(part).items()}
+    return found | ({record["path"]: record} if isinstance(record, dict) and "path" in record else {})
+
+
 def relative_in(folder: Path, record: Any) -> Any:
     """Return a record of identities; paths inside a folder become relative, ``./left.tif``: the folder may be moved."""
     inside = os.path.join(os.path.realpath(folder), "")
@@ -54,8 +61,8 @@ def relative_in(folder: Path, record: Any) -> Any:
 
 def absolute_in(folder: Path, record: Any) -> Any:
     """Return a record of `relative_in` for the place where its folder is now."""
-    here = os.path.realpath(folder)
-    return _with_paths(record, lambda path: os.path.join(here, path[2:]) if path.startswith("./") else path)
+    inside = os.path.join(os.path.realpath(folder), "")
+    return _with_paths(record, lambda path: inside + path[2:] if path.startswith("./") else path)
 
 
 def _with_paths(record: Any, changed: Callable[[str], str]) -> Any:

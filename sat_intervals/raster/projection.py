@@ -33,7 +33,7 @@ def utm_of(longitude: float, latitude: float) -> str:
     area = AreaOfInterest(longitude, latitude, longitude, latitude)
     zones = query_utm_crs_info(datum_name="WGS 84", area_of_interest=area)
     if not zones:
-        raise SatIntervalsError(f"no UTM zone at longitude {longitude:.2f}, latitude {latitude:.2f}: give --crs")
+        raise SatIntervalsError(f"no UTM zone at longitude {longitude:.2f}, latitude {latitude:.2f}: give a CRS")
     return f"EPSG:{zones[0].code}"
 
 
@@ -64,7 +64,7 @@ class Projection:
             )
         if len(target.axis_info) != 2:
             raise SatIntervalsError(
-                f"{crs} ({target.name}) includes heights: give a horizontal CRS, and a geoid with --geoid"
+                f"{crs} ({target.name}) includes heights: give a horizontal CRS, and the geoid apart"
             )
         self.crs, self.definition = crs, target
         self._area = target.area_of_use

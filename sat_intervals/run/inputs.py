@@ -1,6 +1,6 @@
 """The inputs of a run: described at the start, at a resume, and once before publication."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from importlib.metadata import version
 from typing import Any
 
@@ -22,17 +22,6 @@ def describe_inputs(left: Image, right: Image, config: Config, known: Mapping[st
         weights = identity(str(weights_file(config.cost.weights)), known)
         inputs["weights"] = weights | {"onnxruntime": version("onnxruntime")}
     return inputs
-
-
-def identities(inputs: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return the identities of all files of described inputs, by path."""
-    return {file["path"]: file for one in inputs.values() for file in _files_of(one)}
-
-
-def _files_of(described: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    yield {name: described[name] for name in ("path", "bytes", "modified", "sha256", "etag") if name in described}
-    for other in (*described.get("files", ()), *filter(None, [described.get("mask")])):
-        yield from _files_of(other)
 
 
 def check_unchanged(before: Mapping[str, Any], left: Image, right: Image, config: Config) -> None:

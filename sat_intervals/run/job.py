@@ -23,9 +23,9 @@ from sat_intervals.raster import (
     files_of,
     part_bytes,
 )
-from sat_intervals.raster.identity import absolute_in, check_not_replaced, relative_in
+from sat_intervals.raster.identity import absolute_in, check_not_replaced, identities, relative_in
 from sat_intervals.run.checks import check_tiles, checked_pair, checked_region, fitted_to_jobs
-from sat_intervals.run.inputs import describe_inputs, identities
+from sat_intervals.run.inputs import describe_inputs
 from sat_intervals.run.state import OUTPUTS, check_folder, files_of_run, next_step, read_report
 from sat_intervals.run.workers import is_remote
 from sat_intervals.store.folder import folder_at

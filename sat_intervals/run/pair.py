@@ -150,7 +150,7 @@ def check_failures(job: Job, failures: dict[str, BaseException]) -> None:
         waiting = " or wait for their path states" if job.hands_states_on else ""
         raise RunError(
             f"{len(failures)} of {len(job.store.grid)} tiles failed, the others are kept{waiting}; fix the cause and "
-            f"rerun the same command: it resumes; add --overwrite if an input changed:\n{lines}"
+            f"rerun the same command: it resumes; add --overwrite (overwrite=True) if an input changed:\n{lines}"
         ) from min(failures.items())[1]
 
 

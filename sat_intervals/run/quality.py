@@ -122,11 +122,15 @@ def warnings_of(job: Job, counts: Mapping[str, Any], quality: Mapping[str, Any])
     elif of_data or (survey and survey.rows and survey.rows.contradiction):
         of_pair = rows
     else:  # where a given range is wrong, rows are, too
-        of_pair = _rejected(counts, paths) or ([] if was_found else of_range) or [*rows, *of_range]
+        of_pair = (
+            _rejected(counts, paths)
+            or ([] if was_found else of_range)
+            or [*rows, *of_range]
+            or _too_wide(counts, config, paths)
+        )
     noise = noise_line(survey, paths) if config.cost.method == "census" and config.preset == "paper" else []
     missed = unreached(config)
-    wide = [] if of_data or of_pair else _doubts_of_width(counts, config, paths)
-    return [*of_data, *of_pair, *noise, *wide, *([f"{paths[0]}: {missed}"] if missed else [])]
+    return [*of_data, *of_pair, *noise, *([f"{paths[0]}: {missed}"] if missed else [])]
 
 
 def _spoiled(job: Job, counts: Mapping[str, Any], no_data: float) -> list[str]:
@@ -166,15 +170,14 @@ def _doubts_of_range(counts: Mapping[str, Any], search: Disparity, path: str, *,
     return []
 
 
-def _doubts_of_width(counts: Mapping[str, Any], config: Config, paths: tuple[str, str]) -> list[str]:
+def _too_wide(counts: Mapping[str, Any], config: Config, paths: tuple[str, str]) -> list[str]:
     """Return a warning if intervals are far wider than usual: the images have little in common, or no texture."""
     width, usual = counts["median_interval_width"], _usual_width(config)
     if width is None or usual is None or width <= _TOO_WIDE * usual:
         return []
-    way_out = "other dates" if config.cost.method == "mccnn" else "--preset satellite-mccnn, or other dates"
     return [
         f"{paths[0]} and {paths[1]}: the median interval is {width:.1f} px wide, {usual:.1f} px on the calibration's "
-        f"pairs: the images have little texture, or differ, as of dates before and after a change: try {way_out}"
+        "pairs: little texture, or little in common, as before and after a change: try satellite-mccnn or other dates"
     ]
 
 

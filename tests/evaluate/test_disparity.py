@@ -244,7 +244,7 @@ def test_evaluate_run__of_a_region_takes_its_truth_or_the_whole(pair, tmp_path):
 def test_evaluate_run__says_what_is_missing(tmp_path):
     bands, validity, _ = random_bands(20, 30)
     out = write_run(tmp_path, bands, validity)
-    with pytest.raises(SatIntervalsError, match=r"no truth.tif beside its left image .*left.tif: give --truth"):
+    with pytest.raises(SatIntervalsError, match=r"no truth.tif beside its left image .*left.tif: give a truth"):
         evaluate_run(out)
     assert group_beside(tmp_path / "left.tif") == "all"
     (tmp_path / "off").mkdir()

@@ -191,7 +191,8 @@ def test_make_surface__of_runs_that_do_not_meet_has_a_height_that_one_of_them_ha
     x, y = np.meshgrid(np.arange(0.5, 30), -np.arange(0.5, 20))
     heights, halves = random.uniform(0, 60, (3, *x.shape)), random.uniform(0.5, 4, (3, *x.shape))
     runs = [
-        write_points(tmp_path / str(k), x, y, *given) for k, given in enumerate(zip(heights, halves, halves, strict=True))
+        write_points(tmp_path / str(k), x, y, *given)
+        for k, given in enumerate(zip(heights, halves, halves, strict=True))
     ]
     surface, place, _ = surface_of(runs, tmp_path, radius=0.1)
     i, j = cell_of(place, LEFT + x, TOP + y)
@@ -454,7 +455,7 @@ def test_make_surface__refuses_a_geoid_that_ends_before_the_points(tmp_path):
         ("EPSG:4326", "EPSG:32637"),
         ("EPSG:2274", "EPSG:32637"),
         ("nonsense", "EPSG:32637"),
-        ("EPSG:32637+5773", "a geoid with --geoid"),
+        ("EPSG:32637+5773", "a horizontal CRS, and the geoid apart"),
     ],
 )
 def test_projection__refuses_what_is_no_map_in_metres(crs, message):
@@ -480,7 +481,7 @@ def test_make_surface__what_it_cannot_use_gets_one_line(tmp_path):
     bare = write_raster(tmp_path / "bare.tif", np.full((1, 4, 4), 49.5), rasterio.Affine(1, 0, 0, 0, -1, 46), None)
     cases = [
         ([empty], [], "no valid pixel"),
-        (far, [], "choose a coarser --resolution, or runs of one place"),
+        (far, [], "choose a coarser resolution, or runs of one place"),
         ([far[0]], ["--resolution", "-1"], "resolution is -1 m: give one above 0, up to 10000"),
         ([far[0]], ["--grid-like", "x.tif"], "give either --resolution or --grid-like"),
         ([far[0]], ["--max-width", "-2"], "max_width is -2 m: give one above 0, or leave it out"),

@@ -476,7 +476,7 @@ def test_dsm_command__remembers_models_and_grids_in_the_folder(level_run, tmp_pa
     out, files = level_run
     plain = invoke("dsm", out, "--resolution", 1)
     assert (plain.exit_code, plain.stderr.count("\n")) == (2, 1)
-    assert f"{out} has no sensor models and grids yet: give --left-model, --right-model" in plain.stderr
+    assert f"{out} has no sensor models and grids yet: give left and right models and grids" in plain.stderr
     assert invoke("dsm", out, "--resolution", 1, *sensor_words(files)).exit_code == 0
     expected = read(out / "dsm.tif")
     assert invoke("dsm", out, "--resolution", 1).exit_code == 0
