@@ -89,9 +89,6 @@ class PairOfBatch:
     resolution: float | None = None
 
 
-_OF_BATCH = ("name", *_IMAGES, "minimum", "maximum", *Reading.__annotations__, "window", *_SENSORS, "resolution")
-
-
 def is_pair(path: Path) -> bool:
     """Return whether a path looks like the folder of a pair or a table of pairs."""
     return path.suffix.lower() in _TABLES or (path / "left.tif").exists()
@@ -195,7 +192,8 @@ def _checked(place: str, kind: type[Any], values: dict[str, Any]) -> Any:
 
 
 def _of_batch(place: str, row: dict[str, Any], file: Path) -> PairOfBatch:
-    columns = (*_OF_BATCH, *Config.model_fields)
+    columns = ("name", *_IMAGES, "minimum", "maximum", *Reading.__annotations__, "window", *_SENSORS, "resolution")
+    columns += (*Config.model_fields,)
     if unknown := [str(key) for key in row if str(key).split(".")[0] not in columns]:
         raise SatIntervalsError(f"{place}: unknown column {unknown[0]!r}{known(unknown[0], columns)}")
     name = str(row.pop("name"))

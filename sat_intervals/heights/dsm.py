@@ -175,8 +175,7 @@ def check_sensors(files: Sequence[str | Path], resolution: float | Path, crs: st
     lattice = lattice_of(sensors, Window(row, column, 2, 2), 0, 1)
     if isinstance(resolution, Path) or not np.isfinite(lattice.nodes).all():
         return
-    ground = Ground(on_map(lattice, Projection(crs or utm_of(*lattice.middle)), "the pair"))
-    count = ground.pixel_area / resolution**2
+    count = Ground(on_map(lattice, Projection(crs or utm_of(*lattice.middle)), "pair")).pixel_area / resolution**2
     if 2 * count > _CELLS_PER_PIXEL:  # the box around all cells may be twice as large as the image
         raise SatIntervalsError(f"{count:.0f} cells of {resolution:g} m for each pixel: choose a coarser resolution")
 
