@@ -37,7 +37,7 @@ def raw_options(command: Command) -> Command:
             "--altitude",
             type=float,
             metavar="METRES",
-            help="Raw images: height above the ellipsoid that has disparity 0; default that of the largest overlap.",
+            help="Raw images: height above the ellipsoid that has disparity 0; default the middle of the ground's.",
         ),
         click.option(
             "--resolution-of",

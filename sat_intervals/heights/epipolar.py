@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError, check_file
-from sat_intervals.heights.models import SensorImage, common_parts, read_with, shares_at
+from sat_intervals.heights.models import SensorImage, common_heights, common_parts, read_with
 from sat_intervals.kernels.compiled import kernels_of_others
 from sat_intervals.raster import Georeferencing, ground_of, write_layer
 from sat_intervals.tiling import Window
@@ -27,8 +27,8 @@ with kernels_of_others():
 STEP, MARGIN = 30, 2
 # Pixels around the overlap, for ground that is higher or lower than the height of the grids.
 _BEYOND = 60
-# Heights that are tried, and the share of the largest overlap that is as good.
-_HEIGHTS, _AS_GOOD = 64, 0.99
+# Share of the largest overlap that is as good.
+_AS_GOOD = 0.99
 # Share of the largest overlap below which a given altitude is doubted.
 _MUCH = 0.8
 # Ratio of pixel sizes up to which they are equal: the cubic then needs no smoothing.
@@ -92,15 +92,17 @@ def grid_place() -> Georeferencing:
     return Georeferencing(transform=Affine(STEP, 0, first, 0, STEP, first))
 
 
-def epipolar_geometry(left: SensorImage, right: SensorImage, terrain: Terrain, resolution_of: str) -> Epipolar:
-    """Return the grids of the overlap of a raw pair; raise if there is none, or no base."""
-    height = likely_height(left, right) if terrain.altitude is None else terrain.altitude
+def epipolar_geometry(
+    left: SensorImage, right: SensorImage, terrain: Terrain, resolution_of: str, ground: tuple[float, int] | None = None
+) -> Epipolar:
+    """Return the grids of the overlap of a raw pair on the ground, see `ground_of`; raise without overlap or base."""
+    likely = likely_height(left, right)
+    height, reach = (terrain.altitude, 0) if terrain.altitude is not None else ground or (likely, 0)
     for one in (left, right):
         one.check_height(height)
-    share, parts = _overlap(left, right, height, f"at {height:.0f} m above the ellipsoid")
+    share, parts = _overlap(left, right, height, reach, f"at {height:.0f} m above the ellipsoid")
     if terrain.altitude is not None:
-        likely = likely_height(left, right)
-        larger = common_parts(left, right, likely, _BEYOND)[0]
+        larger = float(common_parts(left, right, likely, _BEYOND)[0][0])
         if share < _MUCH * larger:
             _LOG.warning(
                 "at %g m the images overlap by %.0f %%, at %.0f m by %.0f %%: check --altitude",
@@ -114,7 +116,7 @@ def epipolar_geometry(left: SensorImage, right: SensorImage, terrain: Terrain, r
         step = STEP * max(1, max(parts[0].height, parts[0].width) // (_FEW * STEP))
         nodes, *_ = shareloc_grids((left, right), parts, height, spacing, step)
         elevation = _dem(left, right, nodes[0], terrain, height)
-        share, parts = _overlap(left, right, elevation, f"on {terrain.dem}")
+        share, parts = _overlap(left, right, elevation, reach, f"on {terrain.dem}")
     nodes, shape, base = shareloc_grids((left, right), parts, elevation, spacing)
     if not np.isfinite([base, *map(np.sum, nodes)]).all():
         raise SatIntervalsError(f"{terrain.dem} does not cover the epipolar images: give a larger DEM")
@@ -124,6 +126,8 @@ def epipolar_geometry(left: SensorImage, right: SensorImage, terrain: Terrain, r
             f"{left.image.path} and {right.image.path} have a base-to-height ratio of {base_to_height:.3f}: heights "
             f"need at least {_LEAST_BASE:g}: give another pair"
         )
+    if terrain.altitude is None and not (ground or terrain.dem):
+        _LOG.warning("no height of the ground is found: disparity 0 at %.0f m: give --altitude if it is known", height)
     left_scale, right_scale = (scale if scale > _EQUAL else 1.0 for scale in (spacing, spacing / ratio))
     figures = {
         "altitude": None if terrain.dem else round(height, 3),
@@ -136,22 +140,23 @@ def epipolar_geometry(left: SensorImage, right: SensorImage, terrain: Terrain, r
     return Epipolar(*nodes, *shape, (left_scale, right_scale), figures)
 
 
-def _overlap(left: SensorImage, right: SensorImage, elevation: Any, where: str) -> tuple[float, tuple[Window, Window]]:
+def _overlap(
+    left: SensorImage, right: SensorImage, elevation: Any, reach: int, where: str
+) -> tuple[float, tuple[Window, Window]]:
     """Return share and parts of the overlap, see `common_parts`; raise if there is none."""
-    share, parts = common_parts(left, right, elevation, _BEYOND)
+    shares, parts = common_parts(left, right, elevation, max(_BEYOND, reach))
     if parts is None:
         raise SatIntervalsError(
             f"{left.image.path} and {right.image.path} do not overlap {where}: give images of one place, their models, "
             "or another --altitude"
         )
-    return share, parts
+    return float(shares[0]), parts
 
 
 def likely_height(left: SensorImage, right: SensorImage) -> float:
     """Return the height in the domain of both models at which most of the left image is on the right one."""
-    lowest, highest = max(left.heights[0], right.heights[0]), min(left.heights[1], right.heights[1])
-    heights = np.linspace(lowest, max(lowest, highest), _HEIGHTS)
-    shares = shares_at(left, right, heights)
+    heights = common_heights(left, right)
+    shares, _ = common_parts(left, right, heights, 0)
     return float(heights[shares >= _AS_GOOD * shares.max()].mean())
 
 

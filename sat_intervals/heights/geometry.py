@@ -12,7 +12,7 @@ from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.heights.lattice import Lattice
 from sat_intervals.heights.rectified import rectified_files
 from sat_intervals.progress import Progress
-from sat_intervals.raster.identity import absolute_in, identity, relative_in
+from sat_intervals.raster.identity import absolute_in, identity, local_file, relative_in
 from sat_intervals.raster.publishing import write_record
 from sat_intervals.results import Run, open_run
 
@@ -126,7 +126,7 @@ def _noted(run: Run) -> list[Path]:
     if images != _images(run):
         raise SatIntervalsError(f"{file} is of other images than {run.out} now: {_GIVE}")
     for path, record in zip(paths, known, strict=True):
-        check_file(Path(path), _GIVE)
+        check_file(local_file(path) or path, _GIVE)
         if identity(path, {path: record}).get("sha256") != record.get("sha256"):
             raise SatIntervalsError(f"{path} has changed since {file} was written: {_GIVE}")
     return [Path(path) for path in paths]

@@ -1,16 +1,20 @@
 """Read RPC models, and the sensor images that they belong to (shareloc)."""
 
+import logging
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.kernels.compiled import kernels_of_others
-from sat_intervals.raster import Image, find_model, read_rpc_file
+from sat_intervals.raster import Image, between_180, find_model, read_rpc_file
+from sat_intervals.raster.identity import local_file
+from sat_intervals.raster.rpc import local_copy
 from sat_intervals.tiling import Window
 
 try:
@@ -27,23 +31,32 @@ T = TypeVar("T")
 _DOMAIN = 1.1
 # Positions along each side of an image at which the overlap is looked for.
 _SAMPLES = 65
+# Heights that are tried.
+_LEVELS = 64
 _COEFFICIENTS = "num_col", "den_col", "num_row", "den_row"
 _HALVES = "scale_row", "scale_col", "scale_alt", "scale_x", "scale_y"
+
+_LOG = logging.getLogger(__name__)
 
 
 def read_model(path: str | Path) -> Any:
     """Read an RPC model: a raster that GDAL finds one for, a text of coefficients, ``.geom`` or DIMAP XML."""
 
     def read(name: str) -> Any:
-        found = read_rpc_file(name)
-        return GeoModel(name) if found is None else RPC(convert_rio_rpc_to_rpc_dict(found))
+        with TemporaryDirectory() as folder:
+            file = local_copy(name, folder)
+            found = read_rpc_file(file)
+            return GeoModel(file) if found is None else RPC(convert_rio_rpc_to_rpc_dict(found))
 
-    return read_with(Path(path), "RPC model", read)
+    model = read_with(Path(path), "RPC model", read)
+    if abs(model.offset_x) > 180:  # GDAL takes 245 E for 115 W, shareloc does not
+        model.offset_x = between_180(model.offset_x)
+    return model
 
 
 def read_with(path: Path, kind: str, reader: Callable[[str], T]) -> T:
     """Return what a reader makes of a file, with its errors in one line."""
-    check_file(path, f"give the {kind} of the image")
+    check_file(local_file(str(path)) or path, f"give the {kind} of the image")
     try:
         with warnings.catch_warnings(action="ignore"):
             return reader(str(path))
@@ -64,17 +77,19 @@ class SensorImage:
     origin: tuple[float, float]
 
     @classmethod
-    def of(cls, image: Image, model: Path | None) -> "SensorImage":
-        """Read the model of an image, given or found; raise if the image has none, or is not as the sensor took it."""
+    def readings(cls, image: Image, model: Path | None) -> "list[SensorImage]":
+        """Return the image with its model, given or found, for each place that may be meant; raise if none fits."""
         file = str(model) if model else find_model(image.path)
         if file is None:
             raise SatIntervalsError(
                 f"{image.path} has no RPC model in its tags or beside it: give --left-model and --right-model; of an "
                 "epipolar image --left-grid and --right-grid, too"
             )
-        read = cls(image, file, read_model(file), _origin(image))
-        read._check()
-        return read
+        read = read_model(file)
+        found = [cls(image, file, read, origin) for origin in _origins(image, has_tags=file == image.path)]
+        if fitting := [one for one in found if not one._misfit()]:
+            return fitting
+        raise SatIntervalsError(str(found[-1]._misfit()))
 
     @property
     def heights(self) -> tuple[float, float]:
@@ -95,73 +110,78 @@ class SensorImage:
                 "height in this range"
             )
 
-    def _check(self) -> None:
-        """Raise if the model has no figures, or is not that of this image."""
-        numbers = [getattr(self.model, name) for name in _COEFFICIENTS]
-        halves = [getattr(self.model, name) for name in _HALVES]
+    def _misfit(self) -> str | None:
+        """Say why the model is not that of this image: it projects its box of ground elsewhere; None if it fits."""
+        model = self.model
+        numbers = [getattr(model, name) for name in _COEFFICIENTS]
+        halves = [getattr(model, name) for name in _HALVES]
         if not (np.isfinite(numbers).all() and np.isfinite(halves).all() and min(halves) > 0):
-            raise SatIntervalsError(f"{self.file} has coefficients or scales that are no numbers, or no scales above 0")
-        model, size = self.model, (self.image.height, self.image.width)
-        for name, middle, half, first, length in (
-            ("rows", model.offset_row, model.scale_row, self.origin[0], size[0]),
-            ("columns", model.offset_col, model.scale_col, self.origin[1], size[1]),
-        ):
-            if max(abs(first - middle), abs(first + length - middle)) > _DOMAIN * half:
-                raise SatIntervalsError(
-                    f"{self.file} is for {name} {middle - half:.0f} to {middle + half:.0f}, {self.image.path} has "
-                    f"{name} {first:.0f} to {first + length:.0f}: give the model of this image; of a crop, the "
-                    "geotransform must have its place in the whole image"
+            return f"{self.file} has coefficients or scales that are no numbers, or no scales above 0"
+        x, y, height = (axis.ravel() for axis in np.meshgrid(*3 * [[-1.0, 1.0]]))
+        ground = model.offset_x + x * model.scale_x, model.offset_y + y * model.scale_y
+        there = model.inverse_loc(*ground, model.offset_alt + height * model.scale_alt)
+        sizes = self.image.height, self.image.width
+        for name, places, first, size in zip(("rows", "columns"), there[:2], self.origin, sizes, strict=True):
+            lowest, highest = places.min(), places.max()
+            more = (_DOMAIN - 1) / 2 * (highest - lowest)
+            if not lowest - more <= first <= first + size <= highest + more:
+                return (
+                    f"{self.file} is for {name} {lowest:.0f} to {highest:.0f}, {self.image.path} has {name} "
+                    f"{first:.0f} to {first + size:.0f}: give the model of this image; of a crop, the geotransform "
+                    "must have its place in the whole image"
                 )
+        return None
 
 
-def _origin(image: Image) -> tuple[float, float]:
-    place = image.georeferencing
+def _origins(image: Image, *, has_tags: bool) -> list[tuple[float, float]]:
+    """Return the places in the whole image that an image may have, by its geotransform.
+
+    RPC tags of a crop are of the file's own pixels, as GDAL reads them, or of the whole image.
+    """
+    own, place = (0.0, 0.0), image.georeferencing
     if place.transform is None:
-        return 0.0, 0.0
+        return [own]
     a, b, column, d, e, row = place.transform[:6]
-    if place.crs is not None or not np.allclose((a, b, d, e), (1, 0, 0, 1), rtol=0, atol=1e-9):
-        what = place.crs.to_string() if place.crs else f"pixels of {a:g} x {e:g}"
-        raise SatIntervalsError(
-            f"{image.path} is on a map ({what}), as ortho-ready products are: give the image as the sensor took it"
-        )
-    return row, column
+    if place.crs is None and np.allclose((a, b, d, abs(e)), (1, 0, 0, 1), rtol=0, atol=1e-9):
+        there = row if e > 0 else max(0.0, -row), column  # QGIS and world files have -y for rows
+        return [own, there] if has_tags and there != own else [there]
+    what = place.crs.to_string() if place.crs else f"pixels of {a:g} x {e:g}"
+    if has_tags and place.crs and place.crs.is_geographic:  # of NITF: its corners, to a second of arc
+        _LOG.warning("%s: its rough place on the map (%s) is ignored, its RPC tags are taken", image.path, what)
+        return [own]
+    raise SatIntervalsError(
+        f"{image.path} is on a map ({what}), as ortho-ready products are: give the image as the sensor took it"
+    )
 
 
-def shares_at(left: SensorImage, right: SensorImage, heights: np.ndarray) -> np.ndarray:
-    """Return the shares of the left image that the right one shows at some heights ``(n,)`` in metres."""
-    rows, columns = _spread(left)
-    each = np.tile(rows, heights.size), np.tile(columns, heights.size), heights.repeat(rows.size)
-    there = _in_right(left, right, each[0], each[1], each[2])
-    return np.asarray(right.contains(there[:, 0], there[:, 1]).reshape(heights.size, -1).mean(axis=1))
+def common_heights(left: SensorImage, right: SensorImage) -> np.ndarray:
+    """Return heights in the domain of both models."""
+    lowest, highest = max(left.heights[0], right.heights[0]), min(left.heights[1], right.heights[1])
+    return np.linspace(lowest, max(lowest, highest), _LEVELS)
 
 
 def common_parts(
     left: SensorImage, right: SensorImage, elevation: Any, beyond: int
-) -> tuple[float, tuple[Window, Window] | None]:
-    """Return the share of the left image that the right one shows, and the parts of both that do; None without any.
+) -> tuple[np.ndarray, tuple[Window, Window] | None]:
+    """Return the shares of the left image that the right one shows, and the parts of both that do; None without any.
 
-    Parts are grown by ``beyond`` pixels inside the images. ``elevation``: a height in metres, or shareloc's DEM.
+    Parts are grown by ``beyond`` pixels inside the images. ``elevation``: heights in metres ``(n,)``, which give n
+    shares, or one height, or shareloc's DEM.
     """
-    rows, columns = _spread(left)
-    there = _in_right(left, right, rows, columns, elevation)
+    ends = zip(left.origin, (left.image.height, left.image.width), strict=True)
+    places = np.meshgrid(*(first + np.linspace(0, size, _SAMPLES) for first, size in ends), indexing="ij")
+    rows, columns = (np.tile(axis.ravel(), np.size(elevation)) for axis in places)
+    if isinstance(elevation, np.ndarray):
+        elevation = elevation.repeat(_SAMPLES**2)
+    with warnings.catch_warnings(action="ignore"):
+        there = coloc(left.model, right.model, rows, columns, elevation)[0]
     inside = right.contains(there[:, 0], there[:, 1])
+    shares = inside.reshape(-1, _SAMPLES**2).mean(axis=1)
     if not inside.any():
-        return 0.0, None
+        return shares, None
     between = beyond + max(left.image.height, left.image.width) // (_SAMPLES - 1) + 1
     left_part = _part(left, np.stack([rows, columns], axis=1)[inside], between)
-    return float(inside.mean()), (left_part, _part(right, there[inside, :2], between))
-
-
-def _spread(of: SensorImage) -> tuple[np.ndarray, np.ndarray]:
-    """Return rows and columns spread over an image, with its borders."""
-    ends = zip(of.origin, (of.image.height, of.image.width), strict=True)
-    rows, columns = np.meshgrid(*(first + np.linspace(0, size, _SAMPLES) for first, size in ends), indexing="ij")
-    return rows.ravel(), columns.ravel()
-
-
-def _in_right(left: SensorImage, right: SensorImage, rows: np.ndarray, columns: np.ndarray, elevation: Any) -> Any:
-    with warnings.catch_warnings(action="ignore"):
-        return coloc(left.model, right.model, rows, columns, elevation)[0]
+    return shares, (left_part, _part(right, there[inside, :2], between))
 
 
 def _part(of: SensorImage, places: np.ndarray, beyond: int) -> Window:

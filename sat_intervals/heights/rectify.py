@@ -1,6 +1,6 @@
 """Make an epipolar pair of two raw images, with its grids and a record of how it was made: ``rectify.json``."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -64,12 +64,12 @@ def rectify(
     if rectified_files(pair.left.path, pair.right.path):
         raise SatIntervalsError(f"{pair.left.path} and {pair.right.path} are an epipolar pair already: match them")
     progress("geometry", 0, 1)
-    left, right = (SensorImage.of(*one) for one in zip((pair.left, pair.right), pair.models, strict=True))
+    readings = [SensorImage.readings(*one) for one in zip((pair.left, pair.right), pair.models, strict=True)]
     with locked(out):
         record = read_record(out) or {}
-        asked = _asked(pair, left, right, record.get("inputs", {}))
+        asked = _asked(pair, readings[0][0], readings[1][0], record.get("inputs", {}))
         if _is_needed(out, asked, record, overwrite=overwrite):
-            record = _make(pair, left, right, out, asked, progress)
+            record = _make(pair, readings, out, asked, progress)
         if compare and record["rows"] is None:
             record["rows"] = compare(*(out / name for name in IMAGES))
             _note(out, record)
@@ -78,16 +78,18 @@ def rectify(
 
 def _make(
     pair: RawPair,
-    left: "SensorImage",
-    right: "SensorImage",
+    readings: "Sequence[Sequence[SensorImage]]",
     out: Path,
     asked: dict[str, Any],
     progress: Progress,
 ) -> dict[str, Any]:
     """Write all files; return the record."""
     from sat_intervals.heights.epipolar import epipolar_geometry
+    from sat_intervals.heights.ground import read_with_ground
 
-    geometry = epipolar_geometry(left, right, pair.terrain, pair.resolution_of)
+    is_needed = pair.terrain.altitude is None and not pair.terrain.dem
+    left, right, ground = read_with_ground(*readings, is_needed=is_needed)
+    geometry = epipolar_geometry(left, right, pair.terrain, pair.resolution_of, ground)
     with _writer(out, pair, geometry) as images, _grid_writer(out, geometry) as grids:
         _write_images(images, (left, right), geometry, progress)
         grids.write(0, *(np.moveaxis(nodes[..., ::-1], -1, 0) for nodes in (geometry.left, geometry.right)))

@@ -49,7 +49,7 @@ def found_range(pair: Pair, each: Each) -> Found:
         raise NoRangeError(
             f"{pair.names[0]} and {pair.names[1]}: {error}{hints}: give the search range with --disparity MIN MAX (in "
             "Python disparity minimum and maximum), or check that the images are an epipolar pair: raw ones go to "
-            "sat-intervals surface, or to rectify first"
+            "sat-intervals surface, or to rectify first, with the --altitude of the ground"
         ) from None
     return replace(found_range, collars=collars)
 

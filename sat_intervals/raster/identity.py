@@ -3,6 +3,7 @@
 import hashlib
 import os
 import re
+import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from http.client import HTTPException
@@ -16,7 +17,7 @@ from sat_intervals.store.folder import object_tag
 # GDAL's prefixes of object stores, and those of fsspec.
 _STORES = {"/vsis3/": "s3://", "/vsigs/": "gs://", "/vsiaz/": "az://"}
 # GDAL's prefix to read inside an archive.
-_INSIDE = re.compile(r"/vsi\w+/")
+_INSIDE = re.compile(r"/vsi\w+/\{?")
 # Names that are no paths: GDAL's file systems and subdatasets, and URLs.
 _NO_PATH = re.compile(r"/vsi|\w+:")
 # Seconds until a server must answer.
@@ -73,9 +74,18 @@ def _with_paths(record: Any, changed: Callable[[str], str]) -> Any:
 
 def local_file(path: str) -> Path | None:
     """Return the local file behind a GDAL name, such as the archive in ``/vsizip/a.zip/left.tif``; None if remote."""
-    place = Path(_INSIDE.sub("", path, count=1))
-    places = (place,) if str(place) == path else (place, *place.parents)
+    is_inside = _INSIDE.match(path)
+    place = Path(path[is_inside.end() :].replace("}", "", 1) if is_inside else path)
+    places = (place, *place.parents) if is_inside else (place,)
     return next((file for file in places if os.path.isfile(file)), None)
+
+
+def in_zip(name: str) -> zipfile.Path | None:
+    """Return a file in a local zip archive, by its GDAL name; None if it is none."""
+    archive = local_file(name) if name.startswith("/vsizip/") else None
+    if archive is None or not zipfile.is_zipfile(archive):
+        return None
+    return zipfile.Path(archive, name.partition(str(archive))[2].strip("}/"))
 
 
 def _of_file(file: Path, before: Mapping[str, Any]) -> dict[str, Any]:

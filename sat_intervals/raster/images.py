@@ -17,7 +17,7 @@ from sat_intervals.kernels.rows import RowOffsets
 from sat_intervals.raster import gdal
 from sat_intervals.raster.files_of import files_of
 from sat_intervals.raster.georeferencing import Georeferencing, horizontal_name
-from sat_intervals.raster.identity import identity
+from sat_intervals.raster.identity import identity, in_zip
 from sat_intervals.tiling import Window
 
 # Mask flags of bands without a mask of their own: GDAL derives one from nothing, the no-data value or the alpha band.
@@ -174,11 +174,13 @@ def opened(path: str, window: Window | None = None) -> Iterator[DatasetReader]:
 
 
 def _absolute(path: str | os.PathLike[str]) -> str:
-    """Return the absolute path of a local file, and other GDAL names unchanged.
+    """Return the absolute path of a local file, also of a zip archive, and other GDAL names unchanged.
 
     ``link/..`` is the folder above the target of the link, which `os.path.abspath` takes for that above the link.
     """
     name = os.fspath(path)
+    if (inside := in_zip(name)) and inside.at:
+        return f"/vsizip/{{{Path(str(inside.root.filename)).absolute()}}}/{inside.at}"  # paths have no double slash
     return str(Path(name).absolute()) if os.path.exists(name) else name
 
 

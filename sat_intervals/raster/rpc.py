@@ -10,6 +10,7 @@ import numpy as np
 from rasterio import Env
 
 from sat_intervals.raster import gdal
+from sat_intervals.raster.identity import in_zip
 from sat_intervals.raster.images import opened
 
 # What GDAL reads beside an image only, and what shareloc does not read at all.
@@ -20,15 +21,23 @@ _LISTS = [f"{axis}_{part}_COEFF_{i}" for axis in ("LINE", "SAMP") for part in ("
 
 
 def find_model(image: str) -> str | None:
-    """Return the file with the RPC model of an image: beside it, else the image itself; None if there is none."""
+    """Return the file with the RPC model of an image: beside it or its target, else the image itself; None without."""
     with opened(image) as dataset:
         known, files = dataset.rpcs is not None, dataset.files
     if not known:
-        beside = Path(image).with_suffix(".geom")
-        return str(beside) if beside.is_file() else None
+        beside = str(Path(image).with_suffix(".geom"))
+        if (in_zip(beside) or Path(beside)).is_file():
+            return beside
+        return find_model(os.path.realpath(image)) if os.path.islink(image) else None
     # RPC_*.XML of DIMAP is of the whole product: only GDAL moves it to the tile of the image
     own = [file for file in files if Path(file).name.lower().endswith(_BESIDE)]
-    return own[0] if own else image
+    return own[0] if own and not in_zip(image) else image
+
+
+def local_copy(path: str, folder: str) -> str:
+    """Return a path; of a text file in a zip archive that of a copy in a folder: only GDAL reads archives."""
+    file = in_zip(path)
+    return file.root.extract(file.at, folder) if file and path.endswith(".geom") else path
 
 
 def read_rpc_file(path: str) -> dict[str, Any] | None:

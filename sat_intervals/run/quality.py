@@ -151,7 +151,7 @@ def _rejected(counts: Mapping[str, Any], paths: tuple[str, str]) -> list[str]:
         return []
     return [
         f"{paths[0]} and {paths[1]}: cross-checking rejected {100 * rejected / (rejected + counts['valid']):.0f} % of "
-        "the matches: check that both images show the same place, and the search range"
+        "the matches: check that both images show the same place, the search range, and --altitude of raw ones"
     ]
 
 

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 from pathlib import Path
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
@@ -50,7 +51,11 @@ def made(tmp_path_factory, raw):
 def sensor_images(folder):
     from sat_intervals.heights.models import SensorImage
 
-    return [SensorImage.of(open_image(folder / f"{side}.tif"), None) for side in ("left", "right")]
+    return [SensorImage.readings(open_image(folder / f"{side}.tif"), None)[0] for side in ("left", "right")]
+
+
+def read_altitude(folder):
+    return json.loads((folder / "rectify.json").read_text())["altitude"]
 
 
 def errors_of(dsm, scene):
@@ -119,7 +124,7 @@ def test_grids__rows_of_points_at_five_heights_are_equal(data, raw, request):
 
 def test_rectify__makes_the_overlap_and_a_record(made, raw):
     record = json.loads((made / "rectify.json").read_text())
-    assert record["altitude"] == pytest.approx(12, abs=8)
+    assert record["altitude"] == pytest.approx(20.5, abs=4)  # the middle of heights of 3.5 to 37.4 m
     assert record["base_to_height"] == pytest.approx(0.5, abs=0.005)  # VIEWS differ by 1 px of .5 m a metre
     assert record["metres_per_disparity"] == pytest.approx(-1, abs=0.01)
     assert record["pixel_size"] == pytest.approx(0.5, abs=0.005)
@@ -344,6 +349,140 @@ def test_rectify__a_crop_has_grey_levels_where_its_geotransform_and_the_grids_sa
         assert_allclose(pixels[known], (10 * (nodes - origin - 0.5) + 100)[known], rtol=0, atol=0.501)
 
 
+def _rewritten(file, path, part=None, moved=True, rpcs=(), **profile):
+    """Write a part of a raw image, row, column, height and width, with tags that are moved with it and changed."""
+    with rasterio.open(file) as dataset:
+        known = dataset.rpcs.to_dict() | dict(rpcs)
+        row, column, height, width = part or (0, 0, *dataset.shape)
+        pixels = dataset.read()[:, row : row + height, column : column + width]
+        kind = {"driver": "GTiff", "height": height, "width": width, "count": 1, "dtype": pixels.dtype, "nodata": 0}
+    if moved:
+        known |= {"line_off": known["line_off"] - row, "samp_off": known["samp_off"] - column}
+    path.parent.mkdir(exist_ok=True)
+    with rasterio.open(path, "w", rpcs=rasterio.rpc.RPC(**known), **kind | profile) as dataset:
+        dataset.write(pixels)
+    return path
+
+
+def _of_other_heights(file, middle, half):
+    """Return the tags of an image with another domain of heights, in which the same model is linear, too."""
+    with rasterio.open(file) as dataset:
+        known = dataset.rpcs.to_dict()
+    changes = {"height_off": middle, "height_scale": half}
+    for name in ("line_num_coeff", "samp_num_coeff"):
+        numbers = list(known[name])
+        slope = numbers[3] / known["height_scale"]
+        numbers[0] += slope * (middle - known["height_off"])
+        changes[name] = [*numbers[:3], slope * half, *numbers[4:]]
+    return changes
+
+
+@pytest.mark.parametrize(("side", "part"), [(0, (180, 200, 210, 260)), (1, (150, 300, 260, 210))])
+def test_surface__of_a_crop_and_an_image_that_contains_it_is_at_the_height_of_the_ground(
+    side, part, raw, scene, tmp_path
+):
+    pair = [
+        _rewritten(file, tmp_path / file.name, part if i == side else None, rpcs=_of_other_heights(file, 420, 500))
+        for i, file in enumerate(raw)
+    ]
+    result = invoke("surface", *pair, tmp_path / "out", *SETTINGS)
+    assert result.exit_code == 0, result.output
+    assert read_altitude(tmp_path / "out") == pytest.approx(20.5, abs=6)
+    (error, *_), _ = errors_of(tmp_path / "out" / "dsm.tif", scene)
+    assert abs(np.median(error)) < 0.15
+    assert error.size > 0.75 * part[2] * part[3]
+    again = invoke("surface", *pair, tmp_path / "out", *SETTINGS)
+    assert again.exit_code == 0
+    assert "resampling" not in again.output
+
+
+def test_rectify__says_where_the_height_of_the_ground_is_not_found(raw, tmp_path):
+    flat = []
+    for file in raw:
+        flat.append(_rewritten(file, tmp_path / file.name))
+        with rasterio.open(flat[-1], "r+") as dataset:
+            dataset.write(np.full_like(dataset.read(), 300))
+    result = invoke("rectify", *flat, tmp_path / "out")
+    assert result.exit_code == 0
+    assert "no height of the ground is found: disparity 0 at 12 m: give --altitude" in result.stderr
+
+
+@pytest.mark.parametrize("moved", [(True, True), (False, False), (True, False)])
+def test_read_with_ground__tags_of_a_crop_are_read_so_that_the_rows_fit(moved, raw, tmp_path, caplog):
+    from sat_intervals.heights.ground import read_with_ground
+    from sat_intervals.heights.models import SensorImage
+
+    parts = (120, 90, 380, 400), (110, 130, 400, 420)
+    readings = []
+    for file, part, is_moved in zip(raw, parts, moved, strict=True):
+        place = {"moved": is_moved, "transform": Affine.translation(part[1], part[0])}
+        crop = _rewritten(file, tmp_path / file.name, part, **place)
+        readings.append(SensorImage.readings(open_image(crop), None))
+    left, right, ground = read_with_ground(*readings, is_needed=True)
+    assert ground[0] == pytest.approx(20.5, abs=4)
+    assert [left.origin, right.origin] == [
+        (0, 0) if is_moved else part[:2] for part, is_moved in zip(parts, moved, strict=True)
+    ]
+    assert not caplog.text
+
+
+def test_read_with_ground__says_how_tags_are_read_where_the_rows_do_not_tell(raw, tmp_path, caplog):
+    from sat_intervals.heights.ground import read_with_ground
+    from sat_intervals.heights.models import SensorImage
+
+    near = _rewritten(raw[0], tmp_path / "near.tif", (0, 2, 400, 500), transform=Affine.translation(2, 0))
+    left, right = (SensorImage.readings(open_image(file), None) for file in (near, raw[1]))
+    assert read_with_ground(left, right, is_needed=False)[0].origin == (0, 0)
+    assert "near.tif: its RPC tags are taken for its own pixels" in caplog.text
+
+
+def _as_written(kind, file, folder):
+    """Write a raw image, or a link or an archive with it, in another way that says the same."""
+    path = folder / kind / file.name
+    with rasterio.open(file) as dataset:
+        known, height = dataset.rpcs.to_dict(), dataset.height
+    if kind == "scale":  # as s2p writes models of crops
+        changes = {f"{axis}_scale": known[f"{axis}_scale"] / 40 for axis in ("line", "samp")}
+        changes |= {name: [40 * value for value in known[name]] for name in ("line_num_coeff", "samp_num_coeff")}
+        return _rewritten(file, path, rpcs=changes)
+    if kind == "east":
+        return _rewritten(file, path, rpcs={"long_off": known["long_off"] - 360})
+    if kind == "world file":
+        return _rewritten(file, path, transform=Affine(1, 0, 0, 0, -1, height))
+    if kind == "degrees":  # a place that is 90 m off
+        place = Affine(6.2e-6, 0, 1.4511, 0, -4.5e-6, 43.6008)
+        return _rewritten(file, path, crs="EPSG:4326", transform=place)
+    beside = path.with_name("target")
+    beside.mkdir(parents=True, exist_ok=True)
+    _without_tags(file, beside / file.name)
+    _write_geom(file, (beside / file.name).with_suffix(".geom"))
+    if kind == "link":
+        path.symlink_to(beside / file.name)
+        return path
+    with ZipFile(folder / "pair.zip", "a") as archive:
+        for one in (file.name, f"{file.stem}.geom"):
+            archive.write(beside / one, f"in/{one}")
+    return f"/vsizip/{folder / 'pair.zip'}/in/{file.name}"
+
+
+@pytest.mark.parametrize("kind", ["scale", "east", "world file", "degrees", "link", "zip"])
+def test_rectify__places_and_models_written_otherwise_give_the_same_images(kind, made, raw, tmp_path):
+    pair, out = [_as_written(kind, file, tmp_path) for file in raw], tmp_path / "out"
+    result = invoke("rectify", *pair, out, "--altitude", read_altitude(made))
+    assert result.exit_code == 0, result.output
+    assert ("rough place on the map (EPSG:4326) is ignored" in result.stderr) == (kind == "degrees")
+    assert_array_equal(read_layers(out / "left.tif"), read_layers(made / "left.tif"))
+    match = invoke("match", out / "left.tif", out / "right.tif", tmp_path / "run", "--window", 200, 200, 64, 64)
+    assert match.exit_code == 0, match.output
+    assert invoke("dsm", tmp_path / "run", *SETTINGS).exit_code == 0
+
+
+def test_readings__refuse_a_crop_beyond_the_ground_of_its_model(raw, tmp_path):
+    place = Affine.translation(5000, 0)
+    crop = _rewritten(raw[0], tmp_path / "crop.tif", (0, 0, 300, 300), transform=place)
+    refused(["rectify", crop, raw[1], tmp_path / "out", "--left-model", raw[0]], "crop.tif has columns 5000 to 5300")
+
+
 def test_rectify__takes_the_coarser_pixels(raw, tmp_path):
     coarse = tmp_path / "right.tif"
     with rasterio.open(raw[1]) as dataset:
@@ -563,7 +702,10 @@ def test_surface__of_a_model_that_is_off_recovers_the_rows_or_ends_with_one_line
     report = json.loads((tmp_path / "out" / "run.json").read_text())
     rows = np.median([look[2] for look in report["survey"]["rows"]["looks"]])
     assert rows == pytest.approx((3 + 1e-4 * 300) * np.cos(TURNS[1]), abs=0.05)
-    refused(["surface", *far, tmp_path / "far_out", *SETTINGS], "epipolar pair")
+    refusal = invoke("surface", *far, tmp_path / "far_out", *SETTINGS)
+    assert refusal.exit_code == 2
+    assert "no height of the ground is found" in refusal.stderr
+    assert "epipolar pair" in refusal.stderr.splitlines()[-1]
 
 
 def test_surface__of_real_raw_images_is_that_of_the_pair_another_program_made_of_them(shared_data, tmp_path):
@@ -658,8 +800,7 @@ def test_rectify__masks_grow_by_the_pixels_around_and_no_value_becomes_no_data(m
     kind = {"height": mask.shape[0], "width": mask.shape[1], "count": 1, "dtype": "uint8"}
     with rasterio.open(tmp_path / "mask.tif", "w", driver="GTiff", **kind) as dataset:
         dataset.write(mask, 1)
-    altitude = json.loads((made / "rectify.json").read_text())["altitude"]
-    words = "--left-mask", tmp_path / "mask.tif", "--altitude", altitude
+    words = "--left-mask", tmp_path / "mask.tif", "--altitude", read_altitude(made)
     assert invoke("rectify", *raw, tmp_path / "out", *words).exit_code == 0
     before, after = (read_layers(folder / "left.tif")[0] for folder in (made, tmp_path / "out"))
     lost = int(((before > 0) & (after == 0)).sum())

@@ -1,0 +1,88 @@
+"""Find the heights of the ground of a raw pair: match both images, reduced, over all heights of their models."""
+
+import logging
+import math
+from collections.abc import Sequence
+from itertools import product
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from sat_intervals.heights.epipolar import MARGIN, STEP, shareloc_grids
+from sat_intervals.heights.models import SensorImage, common_heights, common_parts
+from sat_intervals.match.search_range import Step, match_level, reduced
+from sat_intervals.raster import BLOCK, read_window
+from sat_intervals.tiling import Window
+
+# Side of the reduced images at most, and at least that of the smaller one, in pixels; reduction at least: rows of
+# models are off by some pixels.
+_SIDE, _LEAST, _REDUCTION = 512, 64, 2
+# Pixels of a surface at least, and share of the pixels of the smaller image that are matched: see `search_range`.
+_SPECKLE, _FEWEST = 60, 0.2
+# Share of matches, stray ones among them, beyond the range at each end, and its half with a margin for them.
+_BEYOND, _HALF = 0.02, 0.6
+# Share of the matches of the best reading of the tags from which another one fits.
+_AS_GOOD = 0.8
+
+_LOG = logging.getLogger(__name__)
+
+
+def read_with_ground(
+    lefts: Sequence[SensorImage], rights: Sequence[SensorImage], *, is_needed: bool
+) -> tuple[SensorImage, SensorImage, tuple[float, int] | None]:
+    """Return the readings of both images whose rows fit, and their ground, see `ground_of`, if it is needed."""
+    pairs = list(product(lefts, rights))
+    if len(pairs) == 1 and not is_needed:
+        return *pairs[0], None
+    grounds, shares = zip(*(ground_of(*pair) for pair in pairs), strict=True)
+    fits = np.array(shares) >= _AS_GOOD * max(shares)
+    chosen = int(fits.argmax())
+    for one, readings in zip(pairs[chosen], (lefts, rights), strict=True):
+        if len(readings) > 1 and fits.sum() > 1:
+            _LOG.warning(
+                "%s: its RPC tags are taken for its own pixels; if they are for an image where it begins at row %g, "
+                "column %g, give that image as its model",
+                *(one.image.path, *readings[-1].origin),
+            )
+    return *pairs[chosen], grounds[chosen] if is_needed else None
+
+
+def ground_of(left: SensorImage, right: SensorImage) -> tuple[tuple[float, int] | None, float]:
+    """Return the middle of the heights of the ground and their reach in pixels, and the share of pixels that match.
+
+    None without enough matches, or where the height hardly matters.
+    """
+    heights = common_heights(left, right)
+    shares, parts = common_parts(left, right, heights, 0)
+    if parts is None:
+        return None, 0.0
+    lowest, highest = heights[np.flatnonzero(shares)[[0, -1]]]
+    sides = [side for part in parts for side in (part.height, part.width)]
+    step = max(_REDUCTION, min(max(sides) // _SIDE, min(sides) // _LEAST))
+    middle = float(lowest + highest) / 2
+    nodes, shape, base = shareloc_grids((left, right), parts, middle, step)
+    most = (highest - lowest) / 2 * base / step
+    if not most > 1:
+        return None, 0.0
+    images = [_epipolar(*one, shape, step) for one in zip((left, right), parts, nodes, strict=True)]
+    found = match_level(images[0], images[1], (-math.ceil(most), math.ceil(most)), _SPECKLE)
+    matched = found.kept.sum() / max(1, min(np.isfinite(image).sum() for image in images))
+    if matched < _FEWEST:
+        return None, 0.0
+    low, high = np.quantile(found.disparity[found.kept], [_BEYOND, 1 - _BEYOND])
+    height = round(float(middle - (low + high) / 2 * step / base))
+    return (height, math.ceil(_HALF * (high - low) * step)), float(matched)
+
+
+def _epipolar(of: SensorImage, part: Window, nodes: np.ndarray, shape: tuple[int, int], step: int) -> np.ndarray:
+    """Return the reduced epipolar image of a part of an image, float32, NaN where not usable."""
+    rows, columns = part.height // step, part.width // step
+    small, most = np.empty((rows, columns), np.float32), max(1, BLOCK // step)
+    for row in range(0, rows, most):
+        strip = small[row : row + most]
+        window = Window(part.row + row * step, part.column, len(strip) * step, columns * step)
+        strip[:] = reduced(*read_window(of.image, window), Step(step, step))
+    at = np.indices(shape) / STEP + MARGIN
+    first = of.origin[0] + part.row, of.origin[1] + part.column
+    places = [(map_coordinates(nodes[..., i], at, order=1) - first[i]) / step - 0.5 for i in (0, 1)]
+    return np.asarray(map_coordinates(small, places, order=1, cval=np.nan))
