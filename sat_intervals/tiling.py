@@ -76,8 +76,8 @@ class View(NamedTuple):
         return View(window, self.inner(self.pixels, window), self.inner(self.state, window))
 
 
-Views = tuple[View, View]
-"""Views of the left and of the right image."""
+Views = tuple[View, ...]
+"""Views of the left and of the right image, or of as many images as a matching cost reads."""
 
 
 @dataclass(frozen=True)

@@ -4,18 +4,17 @@ import numpy as np
 
 from sat_intervals import Config, Window
 from sat_intervals.kernels.matching import cost_volume
-from sat_intervals.match.matching_cost import cost_areas
-from sat_intervals.match.patch import Frame, kernel_settings, patch_areas, patch_windows
+from sat_intervals.match.costs import cost_of
+from sat_intervals.match.patch import Frame, kernel_settings, patch_areas
 from sat_intervals.match.whole import cut, whole_view
 from sat_intervals.products import IMPOSSIBLE_COST
 
 
 def volume_of(left: np.ndarray, right: np.ndarray, config: Config, *, sgm: bool = False) -> np.ndarray:
     """Our costs, aggregated or not: float32, NaN where impossible."""
-    frame = Frame.of_whole(Window(0, 0, *left.shape))
-    windows = patch_windows(frame, config)
-    views = cut(whole_view(left), windows[0]), cut(whole_view(right), windows[1])
-    (costs,) = cost_areas(views, patch_areas(frame, config), config)
+    cost, areas = cost_of(config), patch_areas(Frame.of_whole(Window(0, 0, *left.shape)), config)
+    windows = cost.windows(areas)
+    (costs,) = cost.of_areas((cut(whole_view(left), windows[0]), cut(whole_view(right), windows[1])), areas)
     found = cost_volume(costs.costs, kernel_settings(config)._replace(regularized=sgm))
     return np.where(found == IMPOSSIBLE_COST, np.float32(np.nan), found.astype(np.float32))
 

@@ -21,6 +21,13 @@ class _Penalties(Section):
             raise ValueError(f"p1 {self.p1} is above p2 {self.p2}, the penalty of a larger step: give p1 <= p2")
         return self
 
+    def at_edges(self) -> tuple[list[list[Decimal]], list[list[Decimal]], float] | None:
+        """Return p1 and p2 where the images have edges, and the gradient of an edge in standard deviations, if any.
+
+        Rows are paths, the last one vertical; columns the number of images with an edge.
+        """
+        return None
+
 
 class Sgm(_Penalties):
     """Constant penalties."""
@@ -58,6 +65,11 @@ class MccnnSgm(_Penalties):
                 f"{' and '.join(changed)}: give one (see config --preset mccnn)"
             )
         return self
+
+    def at_edges(self) -> tuple[list[list[Decimal]], list[list[Decimal]], float]:
+        """Return p1 and p2, divided where images have edges."""
+        p1, p2 = ([one / divisor for divisor in (1, self.q1, self.q1 * self.q2)] for one in (self.p1, self.p2))
+        return [p1, p1, p1, [one / self.v for one in p1]], [p2] * 4, self.d
 
 
 AnySgm = Annotated[Sgm | MccnnSgm, Field(discriminator="penalty")]

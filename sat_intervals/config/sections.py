@@ -3,18 +3,14 @@
 import json
 from collections.abc import Mapping
 from decimal import Decimal
-from fractions import Fraction
-from math import floor
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, model_validator
 from pydantic_core import PydanticCustomError
 
-from sat_intervals.config.weights import NETWORKS
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.products import COSINE_STEPS
 
 
 class ConfigError(SatIntervalsError):
@@ -44,11 +40,6 @@ def absolute(value: str) -> str:
     return str(path.parent.resolve() / path.name if ".." in path.parts else path)
 
 
-def network(value: str) -> str:
-    """Return the name of a network as it is, and that of a file as a path."""
-    return value if value in NETWORKS else absolute(value)
-
-
 Odd = Annotated[int, AfterValidator(check_odd)]
 AbsolutePath = Annotated[str, AfterValidator(absolute)]
 # A number whose thresholds must be exact; a plain number in JSON, so that settings of a run can be read back.
@@ -62,8 +53,6 @@ if TYPE_CHECKING:
     Pixels = int
 else:
     Pixels = Annotated[int, Field(ge=-MOST_PIXELS, le=MOST_PIXELS)] | Literal["auto"]
-# Integer costs of a foreign volume, at most: without SGM, and with it together with P2.
-_LEVELS, _SGM_LEVELS = 50_000, 8_190
 
 
 class StrictModel(BaseModel):
@@ -133,80 +122,6 @@ class Disparity(Section):
             raise ValueError(f"minimum is {self.minimum}, maximum is {self.maximum}: give two numbers, or auto twice")
         if not self.is_auto and self.minimum > self.maximum:
             raise ValueError(f"minimum {self.minimum} is above maximum {self.maximum}, swap them")
-        return self
-
-
-class Census(Section):
-    """Matching cost: Hamming distance of Census codes."""
-
-    method: Literal["census"] = Field("census", description="matching cost, census or mccnn")
-    window: Odd = Field(7, ge=3, le=11, description="side of the square window, in pixels")
-
-    steps: ClassVar = 1  # quantisation levels per unit of cost, a bit
-    precomputed: ClassVar = 0  # bytes of a cost: SGM compares codes
-    needs_statistics: ClassVar = False
-
-    @property
-    def largest(self) -> int:
-        """Return the largest integer cost."""
-        return self.window**2 - 1
-
-    @property
-    def ceiling(self) -> int:
-        """Return the part of `Config.impossible_cost` that the cost decides, at least ``largest``; as in libSGM."""
-        return self.window**2
-
-
-class Mccnn(Section):
-    """Matching cost: 1 - cosine of features of the network MC-CNN fast (Zbontar and LeCun 2016)."""
-
-    method: Literal["mccnn"] = Field("mccnn", description="matching cost, census or mccnn")
-    weights: Annotated[str, AfterValidator(network)] = Field(
-        "full", description="network of the extra [mccnn], full or depthwise, or an ONNX file"
-    )
-
-    window: ClassVar = 11  # side of the receptive field of a feature, in pixels
-    steps: ClassVar = COSINE_STEPS  # quantisation levels per unit of cost, a unit of the cosine
-    largest: ClassVar = 2 * COSINE_STEPS  # integer cost
-    ceiling: ClassVar = largest  # as of Census
-    precomputed: ClassVar = 1  # bytes of a cost: those of a patch are computed before SGM
-    needs_statistics: ClassVar = True  # mean and standard deviation of the whole images
-
-
-class Volume(Section):
-    """Matching cost: values of another matcher, see `intervals_of` and ``volume_of`` of `match_pair`."""
-
-    method: Literal["volume"] = Field("volume", description="values of another matcher; from Python only")
-    kind: Literal["cost", "similarity", "probability"] = Field(
-        "cost", description="what the values are: the best is the smallest, or the largest; or they sum to 1"
-    )
-    span: Exact = Field(Decimal(1), gt=0, description="largest possible value minus the smallest; 1 for probabilities")
-    lowest: Exact = Field(Decimal(0), description="smallest possible value")
-    margin: int = Field(0, ge=0, le=1024, description="pixels that volume_of needs around a tile")
-    name: str | None = Field(None, description="of volume_of and its version; by default that of the function")
-
-    precomputed: ClassVar = 2  # bytes of a cost
-    needs_statistics: ClassVar = False
-
-    @property
-    def window(self) -> int:
-        """Return the side of the window that a value depends on, in pixels."""
-        return 2 * self.margin + 1
-
-    def levels(self, p2: Fraction | None) -> int:
-        """Return the number of integer costs that the span becomes: a multiple of a whole span, if that fits.
-
-        ``p2``: the largest penalty of SGM, in units of the values; None without SGM. With it, 8 times the sum of the
-        largest cost and P2 fits in 16 bits.
-        """
-        span = Fraction(self.span)
-        most = _LEVELS if p2 is None else floor(_SGM_LEVELS * span / (span + p2))
-        return most // span.numerator * span.numerator if span.denominator == 1 and span <= most else max(most, 1)
-
-    @model_validator(mode="after")
-    def _check_probability(self) -> Self:
-        if self.kind == "probability" and (self.span != 1 or self.lowest != 0):
-            raise ValueError(f"span is {self.span}, lowest {self.lowest}, but probabilities are 0 to 1: leave both out")
         return self
 
 

@@ -1,8 +1,6 @@
 """All settings of a run, checks across sections, and the integer thresholds derived from them."""
 
-import hashlib
 from collections.abc import Mapping
-from contextlib import suppress
 from decimal import Decimal
 from fractions import Fraction
 from math import ceil, floor, log1p
@@ -13,25 +11,22 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from sat_intervals.config.calibration import Calibration, Levels, at, built_in
+from sat_intervals.config.costs import SECTIONS, AnyCost, Census, Numbers
 from sat_intervals.config.interval import Interval
-from sat_intervals.config.penalties import AnySgm, MccnnSgm, Sgm
+from sat_intervals.config.penalties import AnySgm, Sgm
 from sat_intervals.config.presets import PRESETS, merged, preset_settings
 from sat_intervals.config.sections import (
     Ambiguity,
-    Census,
     Cluster,
     CrossCheck,
     Disparity,
-    Mccnn,
     Median,
     Products,
     Refinement,
     Regularization,
     Section,
     Tiles,
-    Volume,
 )
-from sat_intervals.config.weights import weights_file
 from sat_intervals.products import BOUND_STEPS, IMPOSSIBLE_COST, LOG_SPAN
 
 SGM_PATHS = 8
@@ -46,7 +41,7 @@ class Config(Section):
     rows: Literal["auto", "none"] = Field(
         "auto", description="row offsets of the right image: measured and taken out, or left"
     )
-    cost: Census | Mccnn | Volume = Field(Census(), discriminator="method")
+    cost: AnyCost = Census()
     sgm: AnySgm | None = Sgm()
     ambiguity: Ambiguity | None = Ambiguity()
     interval: Interval | None = Interval()
@@ -67,12 +62,8 @@ class Config(Section):
         preset = values.get("preset", PRESETS[0])
         values = merged(preset_settings(preset) if preset in PRESETS else {}, values)
         cost, sgm = values.get("cost"), values.get("sgm", {})
-        if isinstance(cost, Mapping) and cost.get("method") == "volume":
-            values["sgm"] = sgm = _sgm_of_volume(cost, sgm)
-        if isinstance(sgm, Mapping):
-            is_mccnn = isinstance(cost, Mapping) and cost.get("method") == "mccnn"
-            values["sgm"] = {"penalty": "mc_cnn_fast" if is_mccnn else "constant", **sgm}
-        return values
+        cost = cost if isinstance(cost, Mapping) else {}
+        return values | {"sgm": SECTIONS.get(str(cost.get("method")), Census).completed(cost, sgm)}
 
     @model_validator(mode="after")
     def _check_sections(self) -> Self:
@@ -95,69 +86,39 @@ class Config(Section):
             raise ValueError(
                 "disparity has local ranges, which cross_check.method accurate does not know: use fast, or one range"
             )
-        if isinstance(self.cost, Volume) and (self.disparity.is_local or self.matches_right_view):
+        if not self.cost.has_right_view and (self.disparity.is_local or self.matches_right_view):
             raise ValueError(
-                "cost.method volume goes with one search range and cross_check.method fast: leave out local ranges and "
-                "accurate"
+                f"cost.method {self.cost.method} goes with one search range and cross_check.method fast: leave out "
+                "local ranges and accurate"
             )
         # Neighbouring tiles are compared on a ring of one pixel around the core, which needs complete windows.
         smallest = self.cost.window // 2 + 1
         if self.tiles.overlap != "exact" and self.tiles.overlap < smallest:
-            raise ValueError(
-                f"tiles.overlap is {self.tiles.overlap}, allowed: >= {smallest} with {self._cost_in_words}"
-            )
+            raise ValueError(f"tiles.overlap is {self.tiles.overlap}, allowed: >= {smallest} with {self.cost.words}")
         return self
 
-    def _check_sgm(self, sgm: Sgm | MccnnSgm) -> None:
-        is_census = isinstance(self.cost, Census)
-        if isinstance(self.cost, Volume):
-            if isinstance(sgm, MccnnSgm) or self.cost.kind == "probability":
-                what = f"penalty {sgm.penalty}" if isinstance(sgm, MccnnSgm) else "probabilities"
-                raise ValueError(f"sgm is given with {what}, allowed: constant penalties and costs or similarities")
-            return
-        if is_census and isinstance(sgm, MccnnSgm):
-            raise ValueError(f"sgm.penalty is {sgm.penalty}, allowed: constant with cost.method census")
-        if is_census and sgm.span is not None:
-            raise ValueError("sgm.span is given, but with cost.method census it follows from p2: leave it out")
-        if is_census and (fraction := [name for name in ("p1", "p2") if getattr(sgm, name) % 1]):
-            raise ValueError(f"sgm.{fraction[0]} is {getattr(sgm, fraction[0])}, allowed: whole numbers with census")
-        if not is_census and sgm.span is None:
-            raise ValueError(
-                "sgm.span is missing: it has no default with cost.method mccnn (see config --preset mccnn)"
-            )
+    def _check_sgm(self, sgm: AnySgm) -> None:
+        self.cost.check_penalties(sgm)
         # The largest uint16 marks the summed cost of an impossible candidate.
-        largest = (IMPOSSIBLE_COST - 1) // SGM_PATHS - self.cost.largest
+        largest = (IMPOSSIBLE_COST - 1) // SGM_PATHS - self.numbers.largest
         if self.largest_p2 > largest:
             raise ValueError(
-                f"sgm.p2 is {sgm.p2}, allowed: <= {largest // self.cost.steps} with {self._cost_in_words}, so that "
+                f"sgm.p2 is {sgm.p2}, allowed: <= {largest // self.numbers.steps} with {self.cost.words}, so that "
                 f"costs summed over {SGM_PATHS} paths fit in 16 bits"
             )
         if self.cost_span > self.largest_sum:
             raise ValueError(
-                f"sgm.span is {sgm.span}, allowed: <= {self.largest_sum / self.cost.steps:g} with p2 {sgm.p2}"
+                f"sgm.span is {sgm.span}, allowed: <= {float(self.largest_sum / self.numbers.steps):g} with p2 {sgm.p2}"
             )
 
     @property
-    def _cost_in_words(self) -> str:
-        return f"cost.window {self.cost.window}" if isinstance(self.cost, Census) else f"cost.method {self.cost.method}"
-
-    @property
-    def largest_cost(self) -> int:
-        """Return the largest integer cost before SGM; the smallest is 0."""
-        if isinstance(self.cost, Volume):
-            return self.cost.levels(Fraction(self.sgm.p2) if self.sgm else None)
-        return self.cost.largest
-
-    @property
-    def steps(self) -> Fraction:
-        """Return the number of integer costs of a unit of the settings."""
-        if isinstance(self.cost, Volume):
-            return self.largest_cost / Fraction(self.cost.span)
-        return Fraction(self.cost.steps)
+    def numbers(self) -> Numbers:
+        """Return the integer costs before SGM."""
+        return self.cost.numbers(Fraction(self.sgm.p2) if self.sgm else None)
 
     def in_steps(self, value: Decimal | float | Fraction) -> int:
         """Round a cost in units of the settings to the nearest integer cost."""
-        return floor(Fraction(value) * self.steps + Fraction(1, 2))
+        return floor(Fraction(value) * self.numbers.steps + Fraction(1, 2))
 
     @property
     def matches_right_view(self) -> bool:
@@ -188,14 +149,12 @@ class Config(Section):
     @property
     def impossible_cost(self) -> int:
         """Return the cost of an impossible candidate inside SGM, above every possible cost + P2."""
-        if isinstance(self.cost, Volume):  # with a whole span as with Census
-            return self.largest_cost + self.largest_p2 + 2 * max(1, min(int(self.steps), self.largest_cost // 8))
-        return self.cost.ceiling + self.largest_p2 + self.cost.steps
+        return self.numbers.largest + self.largest_p2 + self.numbers.gap
 
     @property
     def largest_sum(self) -> int:
         """Return the largest possible cost, after SGM if it is on; the smallest is 0."""
-        return self.largest_cost if self.sgm is None else SGM_PATHS * (self.largest_cost + self.largest_p2)
+        return self.numbers.largest if self.sgm is None else SGM_PATHS * (self.numbers.largest + self.largest_p2)
 
     @property
     def cost_span(self) -> int:
@@ -207,14 +166,9 @@ class Config(Section):
         """
         return self.largest_sum if self.sgm is None or self.sgm.span is None else self.in_steps(self.sgm.span)
 
-    @property
-    def _is_logarithmic(self) -> bool:
-        """Return whether costs are logarithms of probabilities."""
-        return isinstance(self.cost, Volume) and self.cost.kind == "probability"
-
     def _excess(self, share: Fraction) -> Fraction:
         """Return the excess of the cost at which the possibility has fallen from 1 by a share."""
-        if self._is_logarithmic:
+        if self.cost.is_logarithmic:
             return Fraction(-log1p(-float(share)) / LOG_SPAN) * self.cost_span
         return share * self.cost_span
 
@@ -276,7 +230,7 @@ class Config(Section):
             return None
         step = Fraction(self.ambiguity.eta_step)
         count = ceil(Fraction(self.ambiguity.eta_max) / step)
-        if self._is_logarithmic:
+        if self.cost.is_logarithmic:
             return tuple(floor(self._excess(i * step)) for i in range(count))
         levels = step * self.cost_span  # integers from here on: fractions would take longer than matching a small tile
         return tuple(i * levels.numerator // levels.denominator for i in range(count))
@@ -300,29 +254,15 @@ class Config(Section):
         return (len(levels) - below).astype(np.uint16)
 
 
-def _sgm_of_volume(cost: Mapping[str, Any], sgm: Any) -> Any:
-    """Return the section ``sgm`` of a foreign volume: none by default; penalties follow from its span."""
-    if sgm is True or (sgm and isinstance(sgm, Mapping)):
-        with suppress(ArithmeticError, ValueError):  # the section names a span that is no number
-            span = Decimal(str(cost.get("span", 1)))
-            return {"p1": float(span / 2), "p2": float(3 * span), **({} if sgm is True else sgm)}
-    return sgm or None
-
-
 def key_of(config: Config) -> dict[str, Any]:
     """Return all settings that decide which coverage a level reaches, as a calibration holds them.
 
     Neither the search range nor alpha nor the quantile of the regularisation is among them.
     """
     sections = config.model_dump(mode="json")
-    cost, sgm, ambiguity, low = (sections[name] for name in ("cost", "sgm", "ambiguity", "regularization"))
-    if isinstance(config.cost, Volume):
-        cost = {name: cost[name] for name in ("method", "kind", "span", "lowest")}
-    if "weights" in cost:
-        with weights_file(cost["weights"]).open("rb") as weights:
-            cost["weights"] = hashlib.file_digest(weights, "sha256").hexdigest()
+    sgm, ambiguity, low = (sections[name] for name in ("sgm", "ambiguity", "regularization"))
     return {
-        "cost": cost,
+        "cost": config.cost.key(),
         "sgm": sgm and {name: value for name, value in sgm.items() if value is not None},
         "span": config.cost_span,
         "ambiguity": ambiguity and {name: ambiguity[name] for name in ("eta_max", "eta_step", "normalization")},

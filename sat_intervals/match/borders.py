@@ -13,8 +13,8 @@ from sat_intervals.config import Config
 from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.kernels.matching import trace
 from sat_intervals.kernels.sgm import WALL, WAVEFRONTS, Borders, Edge
-from sat_intervals.match.costs import MatchingCost
 from sat_intervals.match.local_ranges import LocalRanges
+from sat_intervals.match.matching_cost import AreaCosts
 from sat_intervals.match.patch import Frame, frame_area, mirrored_settings, patch_settings, path_window
 from sat_intervals.tiling import Tile, Window
 
@@ -85,7 +85,7 @@ def borders_of(frame: Frame, config: Config, found: Sequence[Mapping[Place, Bord
 
 
 def trace_area(
-    cost: MatchingCost,
+    cost: AreaCosts,
     frame: Frame,
     borders: Borders,
     wavefront: int,

@@ -8,11 +8,11 @@ import xarray as xr
 
 from sat_intervals.config import Calibration, Config, ConfigError, key_of
 from sat_intervals.match.calibration import calibration_of_parts
-from sat_intervals.match.costs import unmasked
 from sat_intervals.match.foreign import open_foreign
 from sat_intervals.match.gauge import Gauge, at_levels, block_numbers, pairs_of
 from sat_intervals.match.measurement import Measured, ladders
-from sat_intervals.match.volumes import Kind, Values, cost_of, flags_of, matched_volume, volume_config
+from sat_intervals.match.volume import unmasked
+from sat_intervals.match.volumes import Kind, Values, costs_of, flags_of, matched_volume, volume_config
 from sat_intervals.match.whole import scale_of_rows
 
 _FEWEST = 1000  # pixels with truth, of all volumes
@@ -78,7 +78,7 @@ def calibrate_volumes(
                 "x_right = x_left + disparity"
             )
         true = (true - foreign.first) / foreign.step + settings.disparity.minimum
-        cost = cost_of(foreign, flags, settings)
+        cost = costs_of(foreign, flags, settings)
         for pair in pairs_of(rungs):
             high, low = (float(rungs.low[rung]) for rung in pair)
             rows, chosen = matched_volume(foreign, cost, flags, None, at_levels(settings, high, low, None))

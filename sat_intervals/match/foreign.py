@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from sat_intervals.config import ConfigError
-from sat_intervals.match.costs import unmasked
+from sat_intervals.match.volume import unmasked
 
 # Names of dimensions, lower case.
 _DISPARITY, _ROW, _COLUMN = {"disp", "disparity", "disparities", "d"}, {"row", "rows", "y"}, {"col", "column", "x"}

@@ -1,11 +1,11 @@
-"""Features of MC-CNN fast from an ONNX file (Zbontar and LeCun 2016). The only home of onnxruntime.
+"""Matching cost of MC-CNN fast, a network in an ONNX file (Zbontar and LeCun 2016). The only home of onnxruntime.
 
 The network maps one normalised band, ``(rows, columns)``, to a unit vector for every pixel whose 11 x 11 window is
 inside: ``(features, rows - 10, columns - 10)``, a convolution without padding.
 """
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -13,12 +13,19 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.config import Census, Mccnn, Volume
-from sat_intervals.config.weights import INSTALL_MCCNN, weights_file
+from sat_intervals.config import Config
+from sat_intervals.config.weights import INSTALL_MCCNN
 from sat_intervals.errors import ChangedInputError, SatIntervalsError
+from sat_intervals.kernels.correlation import correlate
+from sat_intervals.kernels.cost import Costs, padded_to_lanes, window_state
+from sat_intervals.match.matching_cost import Area, AreaCosts, Given, PairCost, of_area
+from sat_intervals.match.normalization import ImageStatistics
+from sat_intervals.tiling import View, Views
 
 # Radius of the window of a feature, in pixels.
 RADIUS = 5
+# Rows that go through the network at once; few, which limits the memory for features.
+STRIP = 64
 # How an ONNX file says that weights are in another file: the key "location" and the tag of its value.
 _ELSEWHERE = b"\n\x08location\x12"
 # Largest deviation of a feature's length from 1.
@@ -93,20 +100,6 @@ def load_network(file: Path) -> Network:
     return _loaded(_Weights.of(file))
 
 
-def network_of(cost: Census | Mccnn | Volume, inputs: Mapping[str, Any]) -> Network | None:
-    """Return the network of a run with these inputs, on any worker; None if its cost needs none."""
-    if isinstance(cost, Volume):
-        raise SatIntervalsError(f"the costs of this run are those of {cost.name}, which only match_pair calls")
-    if not isinstance(cost, Mccnn):
-        return None
-    weights = _Weights.of(weights_file(cost.weights))
-    if weights.sha256 != inputs.get("weights", {}).get("sha256"):
-        raise ChangedInputError(
-            f"{weights.file} has other weights than the run: restore it, and give all workers the same weights"
-        )
-    return _loaded(weights)
-
-
 @dataclass(frozen=True)
 class _Weights:
     """A file of weights and its content, known by its SHA-256."""
@@ -128,3 +121,66 @@ class _Weights:
 def _loaded(weights: _Weights) -> Network:
     """Make a network, once per process for the same content."""
     return Network(weights.file, weights.content)
+
+
+class MccnnCost(PairCost):
+    """1 - cosine of the features of both views."""
+
+    def __init__(self, config: Config, given: Given) -> None:
+        """Load the network; raise if it is not that of the run."""
+        super().__init__(config, given)
+        weights = _Weights.of(config.cost.files()["weights"])
+        if given.inputs is not None and weights.sha256 != given.inputs.get("weights", {}).get("sha256"):
+            raise ChangedInputError(
+                f"{weights.file} has other weights than the run: restore it, and give all workers the same weights"
+            )
+        self._network = _loaded(weights)
+
+    @staticmethod
+    def check(config: Config) -> None:
+        """Raise if the network cannot be loaded."""
+        load_network(config.cost.files()["weights"])
+
+    def of_areas(
+        self, views: Views, areas: Sequence[Area], made: Sequence[np.ndarray] | None = None
+    ) -> list[AreaCosts]:
+        """Correlate the features of both views."""
+        states = [window_state(view.state, RADIUS) for view in views]
+        made = self._correlations(views, states, areas) if made is None else made
+        return [
+            self._with_views(Costs(costs, None, *of_area(area, views, states, RADIUS)), area, views)
+            for area, costs in zip(areas, made, strict=True)
+        ]
+
+    def _correlations(self, views: Views, states: Sequence[np.ndarray], areas: Sequence[Area]) -> list[np.ndarray]:
+        """Costs of all areas, strip by strip: all areas share the features of a strip, which are then discarded."""
+        statistics, height = self._given.statistics, areas[0].base.height
+        assert statistics is not None  # MC-CNN always comes with them
+        made = [np.empty((height, area.base.width, padded_to_lanes(area.disparities)), np.uint8) for area in areas]
+        for row in range(0, height, STRIP):
+            rows = slice(row, min(row + STRIP, height))
+            strips = [
+                _features(view, state, rows, of_image, self._network)
+                for view, state, of_image in zip(views, states, statistics, strict=True)
+            ]
+            for area, costs in zip(areas, made, strict=True):
+                correlate(*of_area(area, views, strips, RADIUS), costs[rows])
+        return made
+
+
+def _features(view: View, state: np.ndarray, rows: slice, statistics: ImageStatistics, network: Network) -> np.ndarray:
+    """Features of rows of a view, ``(features, rows, columns)``; zero before and after the usable columns."""
+    height, width = rows.stop - rows.start, state.shape[1]
+    usable = np.flatnonzero((state[rows] == 0).any(axis=0))
+    if not usable.size:
+        return np.zeros((network.count, height, width), np.float32)
+    first, last = usable[0], usable[-1] + 1
+    part = np.s_[rows.start : rows.stop + 2 * RADIUS, first : last + 2 * RADIUS]
+    pixels = (view.pixels[part].astype(np.float64) - statistics.mean) / statistics.deviation
+    pixels[view.state[part] != 0] = 0
+    inner = network(pixels.astype(np.float32))
+    if inner.shape[2] == width:
+        return inner
+    features = np.zeros((network.count, height, width), np.float32)
+    features[:, :, first:last] = inner
+    return features

@@ -2,7 +2,7 @@
 
 from math import isqrt
 
-from sat_intervals.config import Config, ConfigError, Mccnn, Volume
+from sat_intervals.config import Config, ConfigError
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.machine import usable_memory
@@ -23,9 +23,6 @@ _FIT_BYTES, _IMAGES_BYTES, _READING_BYTES = 60, 8, 60
 # Per pixel of a strip: final bands, which are compressed one file after another; and per pixel of the columns that are
 # compressed at a time: what is written, read back and compared.
 _BAND_BYTES, _BLOCK_BYTES, _COLUMNS = 18, 64, 2048
-# Per column of a patch: layers of MC-CNN's network for a strip of rows, and the features of both images.
-_NETWORK_BYTES = 140_000
-
 
 # Side in pixels of a block of small tiles, at most: that of one tile of the default size.
 _BLOCK = 1024
@@ -52,16 +49,9 @@ def tile_bytes(config: Config, size: int | None = None) -> int:
     accurate = config.matches_right_view
     if accurate:
         volume = 2 * size * (size + config.disparity.count) * lanes  # the volume of the right view is wider
-    if config.cost.precomputed:
-        of_values = 4 if isinstance(config.cost, Volume) else 0  # those that are converted
-        volume += (
-            (config.cost.precomputed + of_values)
-            * lanes
-            * patch
-            * (patch + accurate * (patch + config.disparity.count))
-        )
-    if isinstance(config.cost, Mccnn):
-        volume += _NETWORK_BYTES * (patch + config.disparity.count)
+    per_candidate = config.cost.precomputed + config.cost.converted
+    volume += per_candidate * lanes * patch * (patch + accurate * (patch + config.disparity.count))
+    volume += config.cost.column_bytes * (patch + config.disparity.count)
     paths = 2 * 3 * (patch + config.disparity.count) * lanes
     together = tiles_together(config, size)
     if config.hands_states_on:

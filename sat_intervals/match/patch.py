@@ -5,17 +5,15 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from sat_intervals.config import Config, Disparity, Sgm, Volume
+from sat_intervals.config import Config, Disparity
 from sat_intervals.kernels.cost import Cells
 from sat_intervals.kernels.matching import Raw, RightView, match_costs
 from sat_intervals.kernels.sgm import Borders, Edge
 from sat_intervals.kernels.sweeps import Settings
-from sat_intervals.match.costs import MatchingCost
 from sat_intervals.match.local_ranges import LocalRanges, narrowed
-from sat_intervals.match.matching_cost import Area, cost_areas, textureless, view_windows
-from sat_intervals.match.normalization import PairStatistics
+from sat_intervals.match.matching_cost import Area, AreaCosts, textureless
 from sat_intervals.products import IMPOSSIBLE_COST, LEFT_MASKED, MASKED, MISMATCH, NO_DISPARITY, RANGE_END
-from sat_intervals.tiling import Views, Window, facing
+from sat_intervals.tiling import Window, facing
 
 # Number of disparities up to which a range has no ends of its own.
 _SHORT = 8
@@ -59,15 +57,14 @@ class Patch(NamedTuple):
 
 def kernel_settings(config: Config) -> Settings:
     """Convert a configuration to the settings of the kernels."""
-    cuts = config.cuts
-    constant = config.sgm if isinstance(config.sgm, Sgm) else None  # penalties at edges come with their gradients
+    cuts, sgm = config.cuts, config.sgm
     return Settings(
         minimum=config.disparity.minimum,
         count=config.disparity.count,
         impossible=config.impossible_cost,
-        p1=config.in_steps(constant.p1) if constant else 0,
-        p2=config.in_steps(constant.p2) if constant else 0,
-        regularized=config.sgm is not None,
+        p1=config.in_steps(sgm.p1) if sgm else 0,
+        p2=config.in_steps(sgm.p2) if sgm else 0,
+        regularized=sgm is not None,
         cut_level=-1 if config.cut_level is None else config.cut_level,
         weights=np.zeros(0, np.uint16) if config.ambiguity_weights is None else config.ambiguity_weights,
         refine=config.refinement is not None,
@@ -157,37 +154,15 @@ def _right_area(frame: Frame, overlap: int, config: Config) -> Area:
     return Area.of(reach.grown(overlap, overlap).clipped(rows), config, mirrored=True)
 
 
-def patch_windows(frame: Frame, config: Config, ranges: LocalRanges | None = None) -> tuple[Window, Window]:
-    """Windows of both images that matching a core needs; see `patch_areas`."""
-    return view_windows(patch_areas(frame, config, ranges), config)
-
-
 def match_patch(
-    views: Views,
     frame: Frame,
-    config: Config,
-    statistics: PairStatistics | None = None,
-    ranges: LocalRanges | None = None,
-) -> Patch:
-    """Match a core from both images in its `patch_windows`; ``frame`` is that of the left view.
-
-    ``statistics`` are those of the whole images; None if the matching cost needs none.
-    """
-    costs = cost_areas(views, patch_areas(frame, config, ranges), config, statistics)
-    return match_costed(views, frame, costs, config, ranges=ranges)
-
-
-def match_costed(
-    views: Views | None,
-    frame: Frame,
-    costs: Sequence[MatchingCost],
+    costs: Sequence[AreaCosts],
     config: Config,
     borders: Sequence[Borders] | None = None,
     ranges: LocalRanges | None = None,
 ) -> Patch:
-    """Match a core as `match_patch` does, from the costs of its `patch_areas`.
+    """Match a core from the costs of its `patch_areas`; ``frame`` is that of the left view.
 
-    ``views`` find textureless pixels, which a foreign volume does not know.
     ``borders`` are path states of the neighbours for each area; by default every path starts where its area does.
     """
     is_exact, core = config.tiles.overlap == "exact", frame.core
@@ -210,10 +185,7 @@ def match_costed(
         right = _of_whole_range(right, right_core, settings)
     inside = output.relative_to(area.base).slices
     raw.validity[cost.state[inside] & MASKED != 0] |= LEFT_MASKED
-    if views is None or isinstance(config.cost, Volume):
-        flat = np.zeros((output.height, output.width), np.bool_)
-    else:
-        flat = textureless(views, area, cost.costs, config, cells)[inside]
+    flat = textureless(cost, area, config, cells)[inside]
     _mark_ambiguous(raw, flat, config)
     _mark_ends(raw, flat, config.disparity)
     if ranges:
@@ -269,7 +241,7 @@ def mirrored_settings(settings: Settings) -> Settings:
 
 
 def match_right(
-    cost: MatchingCost, area: Area, core: Window, settings: Settings, borders: Borders | None = None
+    cost: AreaCosts, area: Area, core: Window, settings: Settings, borders: Borders | None = None
 ) -> tuple[RightView, Edge]:
     """Match right pixels, ``core``, with a volume of their own: the images swap; return also the leaving states."""
     inside = core.relative_to(area.base)

@@ -9,12 +9,13 @@ import xarray as xr
 from sat_intervals.config import Config, ConfigError, load_config, resolved
 from sat_intervals.kernels.curves import read_right_winners
 from sat_intervals.kernels.disparity import cross_check
-from sat_intervals.match.costs import MatchingCost, foreign_costs, integer_costs
 from sat_intervals.match.foreign import Foreign, open_foreign
 from sat_intervals.match.labelled import labelled
+from sat_intervals.match.matching_cost import AreaCosts
 from sat_intervals.match.memory import check_memory, volume_bytes
-from sat_intervals.match.patch import Frame, match_costed
+from sat_intervals.match.patch import Frame, match_patch
 from sat_intervals.match.postprocess import RawRows
+from sat_intervals.match.volume import foreign_costs, integer_costs
 from sat_intervals.match.whole import finish_whole
 from sat_intervals.products import IMPOSSIBLE_COST, INVALID, LEFT_MASKED, NO_DISPARITY, REJECTED, Bands
 from sat_intervals.tiling import Window, strips
@@ -84,7 +85,7 @@ def intervals_of(
         )
     settings = resolved(settings)
     flags = flags_of(valid, foreign.shape)
-    rows, settings = matched_volume(foreign, cost_of(foreign, flags, settings), flags, right, settings)
+    rows, settings = matched_volume(foreign, costs_of(foreign, flags, settings), flags, right, settings)
     return labelled(_in_pixels(finish_whole(rows, settings), foreign, settings), foreign.labels, {})
 
 
@@ -100,7 +101,7 @@ def volume_config(foreign: Foreign, config: Config | Mapping[str, Any] | None) -
     return found
 
 
-def cost_of(foreign: Foreign, flags: np.ndarray, config: Config) -> MatchingCost:
+def costs_of(foreign: Foreign, flags: np.ndarray, config: Config) -> AreaCosts:
     """Return the costs of a volume; ``flags`` are those of pixels that are not matched, see `flags_of`."""
     rows, columns, count = foreign.shape
     check_memory(volume_bytes(rows, columns, config), f"{rows} x {columns} x {count} values", "give parts of it")
@@ -108,7 +109,7 @@ def cost_of(foreign: Foreign, flags: np.ndarray, config: Config) -> MatchingCost
 
 
 def matched_volume(
-    foreign: Foreign, cost: MatchingCost, flags: np.ndarray, right: Values | None, config: Config
+    foreign: Foreign, cost: AreaCosts, flags: np.ndarray, right: Values | None, config: Config
 ) -> tuple[RawRows, Config]:
     """Return the raw products of a volume, cross-checked already if the settings that come back have none."""
     rows, columns, _ = foreign.shape
@@ -116,7 +117,7 @@ def matched_volume(
     is_plain = right is None and foreign.step == 1 and foreign.kind != "probability"
     if checks and not is_plain:
         config = config.model_copy(update={"cross_check": None})
-    patch = match_costed(None, Frame.of_whole(Window(0, 0, rows, columns)), [cost], config)
+    patch = match_patch(Frame.of_whole(Window(0, 0, rows, columns)), [cost], config)
     raw = patch.raw
     if not (raw.winner != NO_DISPARITY).any():
         raise ConfigError("the volume has no finite value at any valid pixel")
@@ -160,8 +161,8 @@ def _of_right(foreign: Foreign, right: Values, config: Config) -> tuple[int, np.
     if there.shape[0] != foreign.shape[0]:
         raise ConfigError(f"the right volume has {there.shape[0]} rows, the left one {foreign.shape[0]}")
     settings = volume_config(there, config)
-    cost = cost_of(there, np.zeros(there.shape[:2], np.uint16), settings)
-    raw = match_costed(None, Frame.of_whole(Window(0, 0, *there.shape[:2])), [cost], settings).raw
+    cost = costs_of(there, np.zeros(there.shape[:2], np.uint16), settings)
+    raw = match_patch(Frame.of_whole(Window(0, 0, *there.shape[:2])), [cost], settings).raw
     back = np.floor(0.5 - (there.first + there.step * (raw.winner.astype(np.float64) - settings.disparity.minimum)))
     back[raw.winner == NO_DISPARITY] = NO_DISPARITY
     first, last = int(np.floor(foreign.disparities[0])), int(np.ceil(foreign.disparities[-1]))

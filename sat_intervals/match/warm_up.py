@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from sat_intervals.config import Config, Volume
-from sat_intervals.kernels.cost import padded_to_lanes
+from sat_intervals.config import Config
 from sat_intervals.kernels.sgm import WAVEFRONTS
 from sat_intervals.match.borders import borders_of, trace_area
+from sat_intervals.match.costs import cost_of
 from sat_intervals.match.local_ranges import LocalRanges
-from sat_intervals.match.matching_cost import cost_areas
+from sat_intervals.match.matching_cost import Given, VolumeOf
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
-from sat_intervals.match.patch import Frame, frame_area, match_costed, patch_areas, patch_windows
+from sat_intervals.match.patch import Frame, frame_area, match_patch, patch_areas
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, postprocess_strips
 from sat_intervals.match.refinement import pixel_windows
 from sat_intervals.tiling import View, Window
@@ -25,22 +25,28 @@ def compile_kernels(config: Config, *, hands_states_on: bool = True) -> None:
     frame = Frame.of_whole(Window(0, 0, 4, 4))
     ends = np.array([search.minimum, search.maximum], np.int16).reshape(2, 1, 1)
     ranges = LocalRanges(ends[0], ends[1], 4, 4) if search.is_local else None
-    windows = patch_windows(frame, config, ranges)
+    statistics = PairStatistics(ImageStatistics(0.5, 0.3), ImageStatistics(0.5, 0.3))
+    cost, areas = cost_of(config, Given(statistics, volume_of=_nothing(config))), patch_areas(frame, config, ranges)
+    windows = cost.windows(areas)
     images = (random.random((window.height, window.width), np.float32) for window in windows)
     left, right = (
         View(window, pixels, np.zeros(pixels.shape, np.uint8)) for window, pixels in zip(windows, images, strict=True)
     )
-    statistics = PairStatistics(ImageStatistics(0.5, 0.3), ImageStatistics(0.5, 0.3))
-    views = left, right
-    area = frame_area(frame, config, ranges)
-    zeros = np.zeros((area.base.height, area.base.width, padded_to_lanes(area.disparities)), np.uint16)
-    made = [zeros] if isinstance(config.cost, Volume) else None
-    costs = cost_areas(views, patch_areas(frame, config, ranges), config, statistics, made=made)
-    match_costed(views, frame, costs, config, ranges=ranges)
+    match_patch(frame, cost.of_areas((left, right), areas), config, ranges=ranges)
     if hands_states_on and config.hands_states_on:
-        (cost,) = cost_areas(views, [area], config, statistics, made=made)
-        trace_area(cost, frame, borders_of(frame, config, [{} for _ in WAVEFRONTS]), 0, config, ranges)
+        (costs,) = cost.of_areas((left, right), [frame_area(frame, config, ranges)])
+        trace_area(costs, frame, borders_of(frame, config, [{} for _ in WAVEFRONTS]), 0, config, ranges)
     compile_postprocessing(config)
+
+
+def _nothing(config: Config) -> VolumeOf:
+    """Return what makes volumes without candidates."""
+
+    def nothing(left: np.ma.MaskedArray, right: np.ma.MaskedArray, _: int) -> np.ndarray:
+        rows, columns = (side - config.cost.window + 1 for side in left.shape)
+        return np.full((rows, columns, right.shape[1] - left.shape[1] + 1), np.nan, np.float32)
+
+    return nothing
 
 
 def compile_postprocessing(config: Config) -> None:

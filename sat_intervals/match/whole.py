@@ -4,9 +4,11 @@ import numpy as np
 
 from sat_intervals.config import Config
 from sat_intervals.kernels.confidence import ambiguity_histogram
+from sat_intervals.match.costs import cost_of
 from sat_intervals.match.local_ranges import LocalRanges
+from sat_intervals.match.matching_cost import Given
 from sat_intervals.match.normalization import PairStatistics
-from sat_intervals.match.patch import Frame, Patch, match_patch, patch_windows
+from sat_intervals.match.patch import Frame, Patch, match_patch, patch_areas
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_rows
 from sat_intervals.match.refinement import pixel_windows, pixels_of
 from sat_intervals.products import NO_DATA, NO_DISPARITY, Bands
@@ -26,10 +28,11 @@ def match_whole(
     None: all pixels search the whole range.
     """
     frame = Frame.of_whole(Window(0, 0, *left.shape))
-    windows = patch_windows(frame, config, ranges)
+    cost, areas = cost_of(config, Given(statistics)), patch_areas(frame, config, ranges)
+    windows = cost.windows(areas)
     whole = whole_view(left), whole_view(right)
     views = cut(whole[0], windows[0]), cut(whole[1], windows[1])
-    patch = match_patch(views, frame, config, statistics, ranges)
+    patch = match_patch(frame, cost.of_areas(views, areas), config, ranges=ranges)
     return finish_whole(whole_rows(patch, whole, frame.whole, config), config)
 
 

@@ -24,9 +24,8 @@ _DIGITS, _FEW_DIGITS, _LARGE = {"float32": 1e-6}, 1e-3, 1e38
 
 
 def read_views(images: Iterable[Image], windows: Iterable[Window]) -> Views:
-    """Read a window of the left and one of the right image; see `read_window`."""
-    left, right = (View(window, *read_window(image, window)) for image, window in zip(images, windows, strict=True))
-    return left, right
+    """Read a window of each image; see `read_window`."""
+    return tuple(View(window, *read_window(image, window)) for image, window in zip(images, windows, strict=True))
 
 
 def read_window(image: Image, window: Window) -> tuple[np.ndarray, np.ndarray]:

@@ -2,11 +2,10 @@
 
 from pathlib import Path
 
-from sat_intervals.config import Config, Mccnn
-from sat_intervals.config.weights import weights_file
+from sat_intervals.config import Config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.machine import usable_cores
-from sat_intervals.match.mccnn import load_network
+from sat_intervals.match.costs import check_cost
 from sat_intervals.match.memory import check_memory, check_strips, fitted, strip_bytes, volume_bytes
 from sat_intervals.raster import BLOCK, Image, check_pair, open_image
 from sat_intervals.run.workers import parse_memory, readers
@@ -32,8 +31,7 @@ def checked_pair(left: str | Path | Image, right: str | Path | Image, config: Co
     check_pair(left, right, 1 if config.disparity.is_auto else config.disparity.count)
     if not config.disparity.is_auto:
         config.disparity.check_images(left.path, left.width, right.path, right.width)
-    if isinstance(config.cost, Mccnn):
-        load_network(weights_file(config.cost.weights))
+    check_cost(config)
     return left, right
 
 

@@ -4,8 +4,7 @@ from collections.abc import Mapping
 from importlib.metadata import version
 from typing import Any
 
-from sat_intervals.config import Config, Mccnn
-from sat_intervals.config.weights import weights_file
+from sat_intervals.config import Config
 from sat_intervals.errors import ChangedInputError, RunError
 from sat_intervals.products import plain
 from sat_intervals.raster import Image, describe, open_image
@@ -14,13 +13,12 @@ from sat_intervals.store.manifest import differences
 
 
 def describe_inputs(left: Image, right: Image, config: Config, known: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what identifies images and weights; see `identity` for ``known``."""
+    """Return what identifies images and the files of the cost; see `identity` for ``known``."""
     inputs = {"left": describe(left, known), "right": describe(right, known)}
     if config.disparity.around:
         inputs["around"] = describe(open_image(config.disparity.around, band=1), known)
-    if isinstance(config.cost, Mccnn):
-        weights = identity(str(weights_file(config.cost.weights)), known)
-        inputs["weights"] = weights | {"onnxruntime": version("onnxruntime")}
+    for name, file in config.cost.files().items():
+        inputs[name] = identity(str(file), known) | {package: version(package) for package in config.cost.packages}
     return inputs
 
 

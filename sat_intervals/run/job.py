@@ -146,9 +146,10 @@ class Job:
         """Raise if this process, a worker, would write other bytes than the command."""
         if any(self.manifest[name] != value for name, value in _made_by().items()):
             raise RunError("this worker has another version of sat-intervals: install the same for all")
-        wanted = self.inputs.get("weights", {}).get("onnxruntime")
-        if wanted and (here := version("onnxruntime")) != wanted:
-            raise RunError(f"onnxruntime is {here} here, but the run has {wanted}: install the same for all workers")
+        for package in self.config.cost.packages:
+            wanted = next(one[package] for one in self.inputs.values() if package in one)
+            if (here := version(package)) != wanted:
+                raise RunError(f"{package} is {here} here, but the run has {wanted}: install the same for all workers")
 
     def ranges(self) -> LocalRanges | None:
         """Return the local search ranges, None without them."""

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.config import Config, Disparity, calibration_of, unreached
-from sat_intervals.match.patch import patch_windows
+from sat_intervals.match.matching_cost import view_windows
+from sat_intervals.match.patch import patch_areas
 from sat_intervals.match.rows import Survey
 from sat_intervals.prepare.pair import is_plain
 from sat_intervals.prepare.search_range import COLLAR, collar_lines
@@ -73,7 +74,7 @@ def _no_data(job: Job, tables: Tables) -> dict[str, float]:
     """Return the share of pixels without data among those that tiles have read, by side."""
     read, usable, ranges = Counter[str](), Counter[str](), job.ranges()
     for tile in job.store.grid:
-        windows = patch_windows(frame_of(job, tile), job.config, ranges)
+        windows = view_windows(patch_areas(frame_of(job, tile), job.config, ranges), job.config)
         for side, image, window in zip(("left", "right"), (job.left, job.right), windows, strict=True):
             inside = window.clipped(Window(0, 0, image.height, image.width))
             read[side] += inside.height * inside.width

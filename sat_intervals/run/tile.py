@@ -16,7 +16,7 @@ from sat_intervals.match.patch import (
     Patch,
     frame_area,
     frames_of,
-    match_costed,
+    match_patch,
     path_window,
 )
 from sat_intervals.match.schedule import Step, needs
@@ -81,7 +81,7 @@ def _match_tile(
         with timed(seconds, "match"):
             if job.hands_states_on:
                 borders = [_borders(job, tile, view, handed, ranges) for view in range(len(costs))]
-            patch = match_costed(views, frame, costs, job.config, borders, ranges)
+            patch = match_patch(frame, costs, job.config, borders, ranges)
         del costs, borders
         with timed(seconds, "write"):
             products = _tile_products(patch, tile, job)

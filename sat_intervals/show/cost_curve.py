@@ -8,8 +8,8 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.curves import read_alpha_cuts, read_subpixel_cut, read_winners
 from sat_intervals.kernels.matching import cost_volume
 from sat_intervals.kernels.sweeps import Settings
-from sat_intervals.match.matching_cost import Area, cost_areas, view_windows
-from sat_intervals.match.mccnn import network_of
+from sat_intervals.match.costs import cost_of
+from sat_intervals.match.matching_cost import Area, Given
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.patch import kernel_settings
 from sat_intervals.products import FLAGS, IMPOSSIBLE_COST, REGULARIZED
@@ -48,12 +48,11 @@ def read_curve(results: Results, row: int, column: int) -> Curve:
     base = pixel.grown(overlap, overlap).clipped(Window(0, 0, results.left.height, results.left.width))
     area = Area.of(base, config)
     settings = kernel_settings(config)
-    views = read_views((results.left, results.right), view_windows([area], config))
     normalization = results.report.get("normalization")
     statistics = PairStatistics.of_report(normalization) if normalization else None
-    network = network_of(config.cost, results.report["inputs"])
-    (cost,) = cost_areas(views, [area], config, statistics, network)
-    volume = cost_volume(cost.costs, settings, cost.gradients)
+    cost = cost_of(config, Given(statistics, results.report["inputs"]))
+    (found,) = cost.of_areas(read_views((results.left, results.right), cost.windows([area])), [area])
+    volume = cost_volume(found.costs, settings, found.gradients)
     curve = np.ascontiguousarray(volume[pixel.relative_to(base).slices])
     possible = curve[0, 0] != IMPOSSIBLE_COST
     if not possible.any():

@@ -23,12 +23,12 @@ import numpy as np
 from sat_intervals.cli.calibrate import write_calibration
 from sat_intervals.cli.tables import show_calibration
 from sat_intervals.config import PRESETS, key_of, load_config
-from sat_intervals.match import matching_cost
-from sat_intervals.match.matching_cost import View
+from sat_intervals.match.mccnn import MccnnCost
 from sat_intervals.match.measurement import Measured
 from sat_intervals.raster import open_image
 from sat_intervals.run.calibrate import calibration_from
 from sat_intervals.run.measure import Subject, measure_subjects, truth_of
+from sat_intervals.tiling import View
 
 DATA = Path(os.environ.get("SAT_INTERVALS_SHARED", "../shared")) / "data"
 ROOT = Path(__file__).parents[2]
@@ -85,19 +85,19 @@ def remembered(make: Callable[..., list[np.ndarray]]) -> Callable[..., list[np.n
     kept: list[tuple[str, list[np.ndarray]]] = []
     lock = Lock()
 
-    def made(views: Sequence[View], *others: Any) -> list[np.ndarray]:
-        digest = hashlib.sha256(repr(others[:2]).encode())
+    def made(cost: MccnnCost, views: Sequence[View], *others: Any) -> list[np.ndarray]:
+        digest = hashlib.sha256(repr((others[1], cost._given.statistics)).encode())
         for view in views:
             digest.update(view.pixels.tobytes() + view.state.tobytes())
         with lock:
             if not kept or kept[0][0] != digest.hexdigest():
-                kept[:] = [(digest.hexdigest(), make(views, *others))]
+                kept[:] = [(digest.hexdigest(), make(cost, views, *others))]
             return kept[0][1]
 
     return made
 
 
-matching_cost._correlations = remembered(matching_cost._correlations)
+MccnnCost._correlations = remembered(MccnnCost._correlations)
 
 
 @cache

@@ -14,7 +14,8 @@ from sat_intervals.kernels.cost import Codes, between
 from sat_intervals.kernels.intervals import regularize
 from sat_intervals.kernels.matching import match_costs
 from sat_intervals.kernels.sweeps import Settings
-from sat_intervals.match.patch import Frame, match_patch, patch_windows
+from sat_intervals.match.costs import cost_of
+from sat_intervals.match.patch import Frame, match_patch, patch_areas
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_rows
 from sat_intervals.prepare.in_memory import match_arrays
 from sat_intervals.products import BOUND_STEPS, IMPOSSIBLE_COST, INVALID, NO_DATA, NO_DISPARITY, REJECTED
@@ -325,9 +326,10 @@ def check(bands, validity, expected, config):
 def test_postprocess_rows__of_a_patch_equals_reference(seed, config, holes):
     left, right, left_state, right_state = image_pair(seed, config.disparity, holes)
     frame = Frame.of_whole(Window(0, 0, *left.shape))
-    windows = patch_windows(frame, config)
+    cost, areas = cost_of(config), patch_areas(frame, config)
+    windows = cost.windows(areas)
     views = view(left, left_state, windows[0]), view(right, right_state, windows[1])
-    patch = match_patch(views, frame, config)
+    patch = match_patch(frame, cost.of_areas(views, areas), config)
     raw, rows = patch.raw, RawRows.of(patch.raw, patch.right)
     scale = ConfidenceScale(np.nan, np.nan)
     if config.ambiguity is not None:

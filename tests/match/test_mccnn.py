@@ -18,7 +18,8 @@ from sat_intervals import RunError, SatIntervalsError, load_config, match_arrays
 from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import ChangedInputError
 from sat_intervals.kernels.matching import cost_volume
-from sat_intervals.match.matching_cost import Area, cost_areas, view_windows
+from sat_intervals.match.costs import cost_of
+from sat_intervals.match.matching_cost import Area, Given
 from sat_intervals.match.mccnn import Network, load_network
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
 from sat_intervals.match.patch import kernel_settings
@@ -134,8 +135,8 @@ def test_network__no_network_is_refused(tmp_path):
 
 # ---- Costs and penalties -----------------------------------------------------------------------------------
 def costs_of(left, right, areas, config, statistics):
-    views = tuple(map(cut, map(whole_view, (left, right)), view_windows(areas, config)))
-    return cost_areas(views, areas, config, statistics)
+    cost = cost_of(config, Given(statistics))
+    return cost.of_areas(tuple(map(cut, map(whole_view, (left, right)), cost.windows(areas))), areas)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])

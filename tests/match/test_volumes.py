@@ -225,6 +225,14 @@ REFUSED = {
         "sgm is given with probabilities",
     ),
     "dimensions": (lambda: (xr.DataArray(ARRAY, dims=("a", "b", "c")), None, {}), "give row, col and disp"),
+    "penalties": (
+        lambda: (ARRAY, range(6), {"config": {"sgm": {"penalty": "mc_cnn_fast", "p1": 5, "p2": 33, "span": 90}}}),
+        "sgm.penalty is mc_cnn_fast, allowed: constant with cost.method volume",
+    ),
+    "large p2": (
+        lambda: (ARRAY, range(6), {"config": {"sgm": {"p2": 1e6}}}),
+        "sgm.p2 is 1000000.0, allowed: <= 90090 with cost.method volume, so that costs summed over 8 paths fit",
+    ),
     "dataset": (lambda: (xr.Dataset({"costs": 1}), None, {}), "has costs, but no cost_volume"),
 }
 

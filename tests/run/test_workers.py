@@ -109,7 +109,7 @@ def test_computing__lets_one_more_thread_read_while_kernels_run(tmp_path, monkey
         return work
 
     monkeypatch.setattr(source, "read_views", read)
-    for kernel in ("match_costed", "ambiguity_histogram"):
+    for kernel in ("match_patch", "ambiguity_histogram"):
         monkeypatch.setattr(tile, kernel, counted(getattr(tile, kernel)))
     match_pair(*pair, tmp_path / "out", settings | {"cluster": {"workers": 1, "store": "memory://tiles"}})
     assert max(most) == 1

@@ -1,0 +1,202 @@
+"""Settings of matching costs, and the numbers that the engine needs of each; `match.costs` has what computes them."""
+
+import hashlib
+from collections.abc import Mapping
+from contextlib import suppress
+from decimal import Decimal
+from fractions import Fraction
+from math import floor
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args
+
+from pydantic import AfterValidator, Field, model_validator
+
+from sat_intervals.config.penalties import AnySgm
+from sat_intervals.config.sections import Exact, Odd, Section, absolute
+from sat_intervals.config.weights import NETWORKS, weights_file
+from sat_intervals.products import COSINE_STEPS
+
+# Integer costs of a foreign volume, at most: without SGM, and with it together with P2.
+_LEVELS, _SGM_LEVELS = 50_000, 8_190
+
+
+class Numbers(NamedTuple):
+    """Integer costs: 0 to ``largest``, ``steps`` for each unit of the settings.
+
+    gap: from ``largest`` + P2 to the cost of an impossible candidate inside SGM.
+    """
+
+    largest: int
+    steps: Fraction
+    gap: int
+
+
+class _Cost(Section):
+    """What the engine asks of a matching cost, beside ``window``: the side of the window that a cost depends on."""
+
+    method: str
+
+    penalties: ClassVar[tuple[str, ...]] = ("constant",)  # that it goes with, its default first
+    precomputed: ClassVar[int] = 0  # bytes of a cost that is computed before SGM; 0: SGM compares codes
+    converted: ClassVar[int] = 0  # bytes of the value that a precomputed cost is made from
+    column_bytes: ClassVar[int] = 0  # of temporary arrays, for each column of a patch
+    needs_statistics: ClassVar[bool] = False  # mean and standard deviation of the whole images
+    has_right_view: ClassVar[bool] = True  # the right view has costs of its own, and cells have ranges of their own
+    packages: ClassVar[tuple[str, ...]] = ()  # whose versions decide the costs
+    named_by: ClassVar[str] = "method"  # key that decides the numbers, for messages
+
+    @property
+    def words(self) -> str:
+        """Return what decides the numbers, in words."""
+        return f"cost.{self.named_by} {getattr(self, self.named_by)}"
+
+    @property
+    def is_logarithmic(self) -> bool:
+        """Return whether costs are logarithms of probabilities."""
+        return False
+
+    @classmethod
+    def completed(cls, cost: Mapping[str, Any], sgm: Any) -> Any:
+        """Return the section ``sgm`` as given, with what follows from the section ``cost``."""
+        return {"penalty": cls.penalties[0], **sgm} if isinstance(sgm, Mapping) else sgm
+
+    def check_penalties(self, sgm: AnySgm) -> None:
+        """Raise if penalties do not fit."""
+        if sgm.penalty not in self.penalties:
+            fit = " or ".join(self.penalties)
+            raise ValueError(f"sgm.penalty is {sgm.penalty}, allowed: {fit} with cost.method {self.method}")
+
+    def files(self) -> dict[str, Path]:
+        """Return the files that decide the costs, by what they hold."""
+        return {}
+
+    def key(self) -> dict[str, Any]:
+        """Return what decides which coverage a level reaches, for calibrations."""
+        return self.model_dump(mode="json")
+
+
+class Census(_Cost):
+    """Matching cost: Hamming distance of Census codes; a unit is a bit."""
+
+    method: Literal["census"] = Field("census", description="matching cost, census or mccnn")
+    window: Odd = Field(7, ge=3, le=11, description="side of the square window, in pixels")
+
+    named_by = "window"
+
+    def numbers(self, p2: Fraction | None) -> Numbers:
+        """Return the integer costs; an impossible one as in libSGM."""
+        return Numbers(self.window**2 - 1, Fraction(1), 2)
+
+    def check_penalties(self, sgm: AnySgm) -> None:
+        """Raise if penalties do not fit."""
+        super().check_penalties(sgm)
+        if sgm.span is not None:
+            raise ValueError("sgm.span is given, but with cost.method census it follows from p2: leave it out")
+        if fraction := [name for name in ("p1", "p2") if getattr(sgm, name) % 1]:
+            raise ValueError(f"sgm.{fraction[0]} is {getattr(sgm, fraction[0])}, allowed: whole numbers with census")
+
+
+class Mccnn(_Cost):
+    """Matching cost: 1 - cosine of features of the network MC-CNN fast (Zbontar and LeCun 2016)."""
+
+    method: Literal["mccnn"] = Field("mccnn", description="matching cost, census or mccnn")
+    weights: Annotated[str, AfterValidator(lambda value: value if value in NETWORKS else absolute(value))] = Field(
+        "full", description="network of the extra [mccnn], full or depthwise, or an ONNX file"
+    )
+
+    window: ClassVar = 11  # of the receptive field of a feature
+    penalties = "mc_cnn_fast", "constant"
+    precomputed = 1
+    column_bytes = 140_000  # layers of the network for a strip of rows, and the features of both images
+    needs_statistics = True
+    packages = ("onnxruntime",)
+
+    def numbers(self, p2: Fraction | None) -> Numbers:
+        """Return the integer costs."""
+        return Numbers(2 * COSINE_STEPS, Fraction(COSINE_STEPS), COSINE_STEPS)
+
+    def check_penalties(self, sgm: AnySgm) -> None:
+        """Raise if penalties do not fit."""
+        super().check_penalties(sgm)
+        if sgm.span is None:
+            raise ValueError(
+                "sgm.span is missing: it has no default with cost.method mccnn (see config --preset mccnn)"
+            )
+
+    def files(self) -> dict[str, Path]:
+        """Return the file of the network."""
+        return {"weights": weights_file(self.weights)}
+
+    def key(self) -> dict[str, Any]:
+        """Return the digest of the network, wherever it is."""
+        with weights_file(self.weights).open("rb") as weights:
+            return super().key() | {"weights": hashlib.file_digest(weights, "sha256").hexdigest()}
+
+
+class Volume(_Cost):
+    """Matching cost: values of another matcher, see `intervals_of` and ``volume_of`` of `match_pair`."""
+
+    method: Literal["volume"] = Field("volume", description="values of another matcher; from Python only")
+    kind: Literal["cost", "similarity", "probability"] = Field(
+        "cost", description="what the values are: the best is the smallest, or the largest; or they sum to 1"
+    )
+    span: Exact = Field(Decimal(1), gt=0, description="largest possible value minus the smallest; 1 for probabilities")
+    lowest: Exact = Field(Decimal(0), description="smallest possible value")
+    margin: int = Field(0, ge=0, le=1024, description="pixels that volume_of needs around a tile")
+    name: str | None = Field(None, description="of volume_of and its version; by default that of the function")
+
+    precomputed = 2
+    converted = 4
+    has_right_view = False
+
+    @property
+    def window(self) -> int:
+        """Return the side of the window that a value depends on, in pixels."""
+        return 2 * self.margin + 1
+
+    @property
+    def is_logarithmic(self) -> bool:
+        """Return whether costs are logarithms of probabilities."""
+        return self.kind == "probability"
+
+    def numbers(self, p2: Fraction | None) -> Numbers:
+        """Return the integer costs: a multiple of a whole span, if that fits; an impossible one as with Census.
+
+        ``p2``: the largest penalty of SGM, in units of the values; None without SGM. With it, 8 times the sum of the
+        largest cost and P2 fits in 16 bits.
+        """
+        span = Fraction(self.span)
+        most = _LEVELS if p2 is None else floor(_SGM_LEVELS * span / (span + p2))
+        is_multiple = span.denominator == 1 and span <= most
+        largest = most // span.numerator * span.numerator if is_multiple else max(most, 1)
+        steps = largest / span
+        return Numbers(largest, steps, 2 * max(1, min(int(steps), largest // 8)))
+
+    @classmethod
+    def completed(cls, cost: Mapping[str, Any], sgm: Any) -> Any:
+        """Return no penalties by default; those that are not given follow from the span."""
+        if sgm is True or (sgm and isinstance(sgm, Mapping)):
+            with suppress(ArithmeticError, ValueError):  # the section names a span that is no number
+                span = Decimal(str(cost.get("span", 1)))
+                sgm = {"p1": float(span / 2), "p2": float(3 * span), **({} if sgm is True else sgm)}
+        return super().completed(cost, sgm or None)
+
+    def check_penalties(self, sgm: AnySgm) -> None:
+        """Raise if penalties do not fit."""
+        super().check_penalties(sgm)
+        if self.is_logarithmic:
+            raise ValueError("sgm is given with probabilities, allowed: constant penalties and costs or similarities")
+
+    def key(self) -> dict[str, Any]:
+        """Return what the values are."""
+        return self.model_dump(mode="json", include={"method", "kind", "span", "lowest"})
+
+    @model_validator(mode="after")
+    def _check_probability(self) -> Self:
+        if self.kind == "probability" and (self.span != 1 or self.lowest != 0):
+            raise ValueError(f"span is {self.span}, lowest {self.lowest}, but probabilities are 0 to 1: leave both out")
+        return self
+
+
+AnyCost = Annotated[Census | Mccnn | Volume, Field(discriminator="method")]
+SECTIONS = {section.model_fields["method"].default: section for section in get_args(get_args(AnyCost)[0])}
