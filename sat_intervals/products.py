@@ -15,6 +15,8 @@ MASKED = 2  # excluded by the user's mask
 
 # Raw products of a tile hold integer disparities; this value marks a missing one.
 NO_DISPARITY = -32768
+# Their bounds are steps above the first disparity of the search range; this value marks a missing one.
+NO_BOUND = 65535
 # The aggregated cost of an impossible candidate, above every declared span.
 IMPOSSIBLE_COST = 65535
 

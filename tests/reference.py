@@ -707,7 +707,7 @@ def span_of(scene):
     return span(scene.window, scene.p2 if scene.regularized else None)
 
 
-def settings_of(scene, alpha="0.9", eta_max="0.7", eta_step="0.01", refine=True, cuts=(-1, -1), steps=0):
+def settings_of(scene, alpha="0.9", eta_max="0.7", eta_step="0.01", refine=True, cuts=(-1, -1), steps=1):
     """The fields of ``sat_intervals.kernels.sweeps.Settings`` for a scene; None = the step is off."""
     cost_span = span_of(scene)
     weights = np.zeros(0, np.uint16)

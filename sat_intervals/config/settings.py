@@ -212,12 +212,12 @@ class Config(Section):
 
     @property
     def bound_steps(self) -> int:
-        """Return the steps per pixel of sub-pixel bounds in the tiles, a power of two; 0 for bounds in whole pixels.
+        """Return the steps per pixel of bounds in the tiles, a power of two; 1 for bounds in whole pixels.
 
-        It is 64 up to 1024 disparities; beyond, the largest with which the range fits in 16 bits.
+        With a coverage it is 64 up to 1024 disparities; beyond, the largest with which the range fits in 16 bits.
         """
         if not self.has_coverage:
-            return 0
+            return 1
         steps = BOUND_STEPS
         while (self.disparity.count - 1) * steps >= np.iinfo(np.uint16).max:
             steps //= 2

@@ -12,21 +12,20 @@ from sat_intervals.kernels.penalties import Gradients
 from sat_intervals.kernels.reading import RightPixels, rectangle_of
 from sat_intervals.kernels.sgm import WAVEFRONTS, Borders, Edge
 from sat_intervals.kernels.sweeps import Settings, Volume, new_buffers, sweep_down, sweep_up, trace_wave
-from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY
+from sat_intervals.products import IMPOSSIBLE_COST, NO_BOUND, NO_DISPARITY
 from sat_intervals.tiling import Window
 
 
 class Raw(NamedTuple):
     """Products read from single curves, all ``(rows, columns)``.
 
-    winner, lower, upper: int16 disparities in pixels, NO_DISPARITY for none. Sub-pixel bounds are uint16, in steps
-        above the first disparity of the whole search range, without meaning where there is no winner.
+    winner: int16 disparities in pixels, NO_DISPARITY for none.
+    lower, upper: uint16 bounds in steps above the first disparity of the whole search range, NO_BOUND for none.
     disparity: float32 refined disparity in pixels, NaN for none.
     cost: uint16 aggregated cost of the winner, IMPOSSIBLE_COST for none.
     ambiguity: uint32, 0 where there is no candidate.
     validity: uint16 flags, without those of the left image's mask, cross-checking and regularisation.
-    lower_low, upper_low: sub-pixel bounds at the level of low-confidence pixels; those at the other level are ``lower``
-        and ``upper``. ``(0, 0)`` for bounds in whole pixels.
+    lower_low, upper_low: the same at the level of low-confidence pixels; those of one level are the same arrays.
     """
 
     winner: np.ndarray
@@ -38,10 +37,6 @@ class Raw(NamedTuple):
     validity: np.ndarray
     lower_low: np.ndarray
     upper_low: np.ndarray
-
-
-# Bounds of `Raw` and of the rows of postprocessing.
-BOUNDS = ("lower", "upper", "lower_low", "upper_low")
 
 
 class RightView(NamedTuple):
@@ -72,20 +67,21 @@ def _sweep(costs, gradients, settings, output, core, keep, borders, cells):
     size = padded_to_lanes(settings.count)
     buffers = new_buffers(costs, gradients, settings, borders, cells)
     shape = output.height, output.width
-    of_low = shape if settings.steps else (0, 0)
     # Allocated for each tile: a buffer kept between tiles (4 % faster) can pause a dask worker above its memory limit.
     starts = volume_starts(buffers.cells, output)
     volume = Volume(np.empty(starts[-1], np.uint16), starts, np.zeros(costs.left_state.shape[1], np.int64))
+    bounds = [np.full(shape, NO_BOUND, np.uint16) for _ in range(2 + 2 * (settings.low >= 0))]
+    lower, upper, lower_low, upper_low = bounds[:2] + bounds[-2:]
     raw = Raw(
         winner=np.full(shape, NO_DISPARITY, np.int16),
-        lower=np.full(shape, NO_DISPARITY, np.int16),
-        upper=np.full(shape, NO_DISPARITY, np.int16),
+        lower=lower,
+        upper=upper,
         disparity=np.full(shape, np.nan, np.float32),
         cost=np.full(shape, IMPOSSIBLE_COST, np.uint16),
         ambiguity=np.zeros(shape, np.uint32),
         validity=np.zeros(shape, np.uint16),
-        lower_low=np.full(of_low, NO_DISPARITY, np.int16),
-        upper_low=np.full(of_low, NO_DISPARITY, np.int16),
+        lower_low=lower_low,
+        upper_low=upper_low,
     )
     wanted, cores = rectangle_of(output), rectangle_of(core)
     cost = np.full((core.height, core.width + size), IMPOSSIBLE_COST, np.uint16)
@@ -97,8 +93,6 @@ def _sweep(costs, gradients, settings, output, core, keep, borders, cells):
     cost = cost[:, : core.width + settings.count - 1]
     winner = right.best[:, : cost.shape[1]].astype(np.int16) + np.int16(settings.minimum)
     winner[cost == IMPOSSIBLE_COST] = NO_DISPARITY
-    if settings.steps:  # the sweep only carries them as int16: compiled once for both kinds
-        raw = raw._replace(**{name: getattr(raw, name).view(np.uint16) for name in BOUNDS})
     return Matched(raw, RightView(cost, winner), buffers.leaving), volume.sums
 
 
@@ -142,11 +136,13 @@ def match_costs(
     return _sweep(costs, gradients, settings, output, core or output, False, borders, cells)[0]
 
 
-def cost_volume(costs: Costs, settings: Settings, gradients: Gradients | None = None) -> np.ndarray:
-    """Aggregated costs of a whole patch; without SGM these are the matching costs.
+def cost_volume(
+    costs: Costs, settings: Settings, gradients: Gradients | None = None, output: Window | None = None
+) -> np.ndarray:
+    """Aggregated costs of the pixels of ``output``, by default the whole patch; without SGM the matching costs.
 
     Parameters as in `match_costs`. Returns ``(rows, columns, count)`` uint16, IMPOSSIBLE_COST at impossible candidates.
     """
-    whole = Window(0, 0, *costs.left_state.shape)
-    sums = _sweep(costs, gradients, settings, whole, whole, True, None, None)[1]
-    return sums.reshape(*costs.left_state.shape, -1)[:, :, : settings.count]
+    output = output or Window(0, 0, *costs.left_state.shape)
+    sums = _sweep(costs, gradients, settings, output, output, True, None, None)[1]
+    return sums.reshape(output.height, output.width, -1)[:, :, : settings.count]

@@ -29,8 +29,8 @@ from sat_intervals.products import (
     IMPOSSIBLE_COST,
     LEFT_WINDOW,
     MASKED,
+    NO_BOUND,
     NO_CANDIDATE,
-    NO_DISPARITY,
     RANGE_INCOMPLETE,
     RIGHT_MASKED,
 )
@@ -163,16 +163,16 @@ def search_flags(costs, r, c, span, possible):
 def read_curve(curve, span, lowest, settings):
     """Winner, sub-pixel shift, whether it was refined, the bounds of both levels and ambiguity of a finished curve.
 
-    Bounds are disparities, or steps with sub-pixel cuts; NO_DISPARITY for a level that is off.
+    Bounds are steps above the first disparity of the whole search range; NO_BOUND if they are off.
     """
     k = _winner(curve, span, lowest)
     shift, refined = vfit(curve, k, settings.count) if settings.refine else (0.0, False)
-    high = low = NO_DISPARITY, NO_DISPARITY
-    if settings.steps > 0:
+    high = low = NO_BOUND, NO_BOUND
+    if settings.high >= 0:
         high, low = subpixel_cuts(curve, span, lowest, k + shift, settings)
     elif settings.cut_level >= 0:
         first, last = _interval(curve, span, lowest, settings.cut_level, settings.refine)
-        high = settings.minimum + first, settings.minimum + last
+        high = low = (settings.offset + first) * settings.steps, (settings.offset + last) * settings.steps
     # An empty table counts nothing. In a branch, numba would count references at every pixel: 4 to 7 % slower.
     stop = span.last + 1 if settings.weights.size else span.first
     amount = ambiguity(curve, span.first, stop, lowest, settings.weights)

@@ -64,8 +64,8 @@ class Settings(NamedTuple):
     impossible: matching cost of an impossible candidate inside SGM, above all possible ones.
     p1, p2, regularized: constant SGM penalties, and whether SGM runs; else the aggregated cost is the matching cost.
     cut_level: ``floor((1 - alpha) * span)`` of bounds in whole pixels; -1: none.
-    high, low, steps: levels of sub-pixel cuts above the lowest cost, of high and of low confidence, and steps per pixel
-        of their bounds. ``steps`` 0: bounds in whole pixels.
+    high, low: levels of sub-pixel cuts above the lowest cost, of high and of low confidence; -1: none.
+    steps: of bounds, per pixel.
     weights: uint16: the table of `ambiguity`, for every cost above the lowest; empty: no ambiguity.
     refine: whether winners are refined, and bounds extended by one for it.
     offset, total: first disparity, and number of disparities, of the whole search range that this one is a part of:
@@ -83,7 +83,7 @@ class Settings(NamedTuple):
     refine: bool
     high: float = -1.0
     low: float = -1.0
-    steps: int = 0
+    steps: int = 1
     offset: int = 0
     total: int = 0
 
@@ -266,8 +266,7 @@ def sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
             lowest = close_impossible(curve, candidates, span, r, c, settings.impossible)
             winner[i, j], shift, refined, high, low, ambiguity[i, j] = read_curve(curve, span, lowest, settings)
             lower[i, j], upper[i, j] = high
-            if settings.steps > 0:
-                lower_low[i, j], upper_low[i, j] = low
+            lower_low[i, j], upper_low[i, j] = low
             disparity[i, j], cost[i, j] = winner[i, j] + shift, lowest
             if not refined:
                 validity[i, j] |= NOT_REFINED

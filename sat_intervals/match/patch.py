@@ -204,11 +204,8 @@ def _mark_ambiguous(raw: Raw, flat: np.ndarray, config: Config) -> None:
         return
     ambiguous = flat & (raw.winner != NO_DISPARITY)
     if config.interval:
-        search, steps = config.disparity, config.bound_steps
-        first, last = (0, steps * (search.count - 1)) if steps else (search.minimum, search.maximum)
-        raw.lower[ambiguous], raw.upper[ambiguous] = first, last
-        if steps:
-            raw.lower_low[ambiguous], raw.upper_low[ambiguous] = first, last
+        raw.lower[ambiguous] = raw.lower_low[ambiguous] = 0
+        raw.upper[ambiguous] = raw.upper_low[ambiguous] = config.bound_steps * (config.disparity.count - 1)
     raw.ambiguity[ambiguous] = config.largest_ambiguity
 
 
@@ -237,7 +234,9 @@ def _reject_ends(raw: Raw, least: np.ndarray, most: np.ndarray, search: Disparit
 def mirrored_settings(settings: Settings) -> Settings:
     """Settings of the right view, where disparities change sign; only its winners are read."""
     maximum = settings.minimum + settings.count - 1
-    return settings._replace(minimum=-maximum, cut_level=-1, steps=0, weights=np.zeros(0, np.uint16), refine=False)
+    return settings._replace(
+        minimum=-maximum, cut_level=-1, high=-1.0, low=-1.0, weights=np.zeros(0, np.uint16), refine=False
+    )
 
 
 def match_right(

@@ -37,14 +37,14 @@ Rows = TypeVar("Rows", bound=tuple[Any, ...])
 
 
 class RawRows(NamedTuple):
-    """Raw products of full-width rows, all ``(rows, columns)`` except the last.
+    """Raw products of full-width rows, all ``(rows, columns)`` except the last three.
 
-    winner, lower, upper: int16 disparities in pixels, NO_DISPARITY for none; bounds may be in steps, see `Raw`.
+    winner: int16 disparities in pixels, NO_DISPARITY for none.
+    lower, upper, lower_low, upper_low: uint16 bounds in steps, of high and of low confidence, see `Raw`.
     disparity: float32 pixels, NaN for none.
     ambiguity: uint32.
     validity: uint16 flags.
     right_winner: ``(rows, columns + count - 1)`` int16, see `RightView`.
-    lower_low, upper_low: bounds of low-confidence pixels, see `Raw`; empty for bounds in whole pixels.
     left, right: pixels of both images, see `refinement.pixel_windows`; empty without least squares.
     """
 
@@ -54,9 +54,9 @@ class RawRows(NamedTuple):
     disparity: np.ndarray
     ambiguity: np.ndarray
     validity: np.ndarray
+    lower_low: np.ndarray
+    upper_low: np.ndarray
     right_winner: np.ndarray
-    lower_low: np.ndarray = _EMPTY
-    upper_low: np.ndarray = _EMPTY
     left: np.ndarray = _EMPTY
     right: np.ndarray = _EMPTY
 
@@ -169,7 +169,7 @@ def widened(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Widen bounds to contain the disparity, rounded outwards: medians or quantiles may have moved them past it."""
     lower, upper = np.minimum(lower, disparity), np.maximum(upper, disparity)
-    if config.bound_steps:
+    if config.has_coverage:
         for round_, bound in ((np.floor, lower), (np.ceil, upper)):  # in place: half the time
             bound *= BOUND_STEPS
             round_(bound, out=bound)
@@ -199,7 +199,7 @@ def _bounds(rows: RawRows, low: np.ndarray | None, kept: np.ndarray, config: Con
         nothing = np.full(rows.lower.shape, np.float32(np.nan))
         return nothing, nothing
     lower, upper = rows.lower, rows.upper
-    if low is None or not config.bound_steps:
+    if low is None or not config.has_coverage:
         return _filtered(lower, kept, config), _filtered(upper, kept, config)
     if config.fits:
         lower, upper = (
@@ -214,9 +214,8 @@ def _bounds(rows: RawRows, low: np.ndarray | None, kept: np.ndarray, config: Con
 def _filtered(bound: np.ndarray, kept: np.ndarray, config: Config) -> np.ndarray:
     """Convert bounds to pixels, and take their medians."""
     bound = bound.astype(np.float32)
-    if config.bound_steps:
-        bound /= config.bound_steps
-        bound += np.float32(config.disparity.minimum)
+    bound /= config.bound_steps
+    bound += np.float32(config.disparity.minimum)
     return np.asarray(median(bound, kept, config.median.size)) if config.median else bound
 
 
@@ -238,7 +237,7 @@ def regularized(
         settings.depth,
         quantile,
         (first - top, last - top),
-        min(_STEPS, config.bound_steps) if config.bound_steps else 2,
+        max(2, min(_STEPS, config.bound_steps)),
     )
     return lower, upper
 

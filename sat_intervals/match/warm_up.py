@@ -55,10 +55,10 @@ def compile_postprocessing(config: Config) -> None:
     def zeros(dtype: type[np.generic], wider: int = 0) -> np.ndarray:
         return np.zeros((4, 4 + wider), dtype)
 
-    lower, upper, lower_low, upper_low = (zeros(np.uint16 if config.bound_steps else np.int16) for _ in range(4))
+    bound = zeros(np.uint16)
     rows = RawRows(
-        zeros(np.int16), lower, upper, zeros(np.float32), zeros(np.uint32), zeros(np.uint16),
-        zeros(np.int16, config.disparity.count - 1), lower_low, upper_low,
+        zeros(np.int16), bound, bound, zeros(np.float32), zeros(np.uint32), zeros(np.uint16), bound, bound,
+        zeros(np.int16, config.disparity.count - 1),
         *(zeros(np.float32, window.width - 4) for window in pixel_windows(Window(0, 0, 4, 4), config)),
     )  # fmt: skip
     list(postprocess_strips([rows], ConfidenceScale(0.0, 1.0), config))

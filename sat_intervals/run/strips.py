@@ -155,7 +155,9 @@ def raw_rows(job: Job, config: Config, first: int, last: int) -> Iterator[RawRow
         left, right = pixels_of(read_views((job.left, job.right), pixel_windows(window, config)))
     row = 0
     for piece in job.store.strips(max(1, STRIP_PIXELS // region.width), search.count, first, last):
-        rows = RawRows(**piece)
+        rows = RawRows(
+            **{"lower_low": piece["lower"], "upper_low": piece["upper"]} | piece
+        )  # both if there is one level
         here = slice(row, row := row + len(rows.winner))
         yield rows._replace(left=left[here], right=right[here]) if config.fits else rows
 

@@ -5,8 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.kernels.curves import read_alpha_cuts, read_subpixel_cut, read_winners
-from sat_intervals.kernels.matching import cost_volume
+from sat_intervals.kernels.matching import cost_volume, match_costs
 from sat_intervals.kernels.sweeps import Settings
 from sat_intervals.match.costs import cost_of
 from sat_intervals.match.matching_cost import Area, Given
@@ -51,45 +50,37 @@ def read_curve(results: Results, row: int, column: int) -> Curve:
     normalization = results.report.get("normalization")
     statistics = PairStatistics.of_report(normalization) if normalization else None
     cost = cost_of(config, Given(statistics, results.report["inputs"]))
-    (found,) = cost.of_areas(read_views((results.left, results.right), cost.windows([area])), [area])
-    volume = cost_volume(found.costs, settings, found.gradients)
-    curve = np.ascontiguousarray(volume[pixel.relative_to(base).slices])
-    possible = curve[0, 0] != IMPOSSIBLE_COST
+    (costs,) = cost.of_areas(read_views((results.left, results.right), cost.windows([area])), [area])
+    there = pixel.relative_to(base)
+    curve = cost_volume(costs.costs, settings, costs.gradients, there)[0, 0]
+    possible = curve != IMPOSSIBLE_COST
     if not possible.any():
         validity = int(results.read_pixel(row, column).validity)
         reasons = "; ".join(flag.meaning for flag in FLAGS if flag.invalid and validity & flag.value)
         where = f"row {row}, column {column} has no cost curve"
         raise SatIntervalsError(f"{where}: {reasons}: choose a pixel that was matched")
-    costs = np.where(possible, curve[0, 0].astype(np.float64), np.nan)
-    above = costs - np.nanmin(costs)
-    _, disparity, _ = read_winners(curve, settings.minimum, settings.weights, settings.refine)
-    largest = _largest_above(results, row, column, settings)
-    lower, upper = _bounds(curve, largest, float(disparity[0, 0]), settings)
+    values = np.where(possible, curve.astype(np.float64), np.nan)
+    above = values - np.nanmin(values)
+    is_low = bool(results.read_pixel(row, column).validity & REGULARIZED)
+    largest = _largest_above(settings, is_low)
+    raw = match_costs(costs.costs, settings, there, gradients=costs.gradients).raw
+    bounds = (raw.lower_low, raw.upper_low) if is_low else (raw.lower, raw.upper)
+    lower, upper = (settings.minimum + bound.item() / settings.steps for bound in bounds)
     alpha = config.interval and config.interval.alpha
     return Curve(
         disparities=np.arange(settings.minimum, settings.minimum + settings.count),
-        costs=costs,
+        costs=values,
         possibilities=np.maximum(1 - above / config.cost_span, 0),
         level=float(alpha or np.maximum(1 - largest / config.cost_span, 0)),
         cut=above <= largest,
-        disparity=float(disparity[0, 0]),
-        lower=lower,
-        upper=upper,
+        disparity=raw.disparity.item(),
+        lower=np.nan if np.isnan(largest) else lower,
+        upper=np.nan if np.isnan(largest) else upper,
     )
 
 
-def _largest_above(results: Results, row: int, column: int, settings: Settings) -> float:
+def _largest_above(settings: Settings, is_low: bool) -> float:
     """Return the largest cost above the lowest that belongs to the cut of a pixel's class; NaN without intervals."""
-    if settings.steps == 0:
-        return settings.cut_level if settings.cut_level >= 0 else np.nan
-    is_low = results.read_pixel(row, column).validity & REGULARIZED
-    return settings.low if is_low else settings.high
-
-
-def _bounds(curve: np.ndarray, largest: float, disparity: float, settings: Settings) -> tuple[float, float]:
-    if np.isnan(largest):
-        return np.nan, np.nan
-    if settings.steps:
-        return read_subpixel_cut(curve[0, 0], settings.minimum, largest, settings.steps, disparity)
-    lower, upper = read_alpha_cuts(curve, settings.minimum, settings.cut_level, settings.refine)
-    return int(lower[0, 0]), int(upper[0, 0])
+    if settings.high >= 0:
+        return settings.low if is_low else settings.high
+    return settings.cut_level if settings.cut_level >= 0 else np.nan

@@ -15,7 +15,7 @@ from sat_intervals.store.folder import Folder
 from sat_intervals.tiling import Grid, Tile
 
 # Increase when files change: older tiles cannot be resumed.
-LAYOUT = 13
+LAYOUT = 14
 # Subfolders: path states on borders, pixels and costs for later steps, tiles, parts of final files, failures, and
 # what is measured once a run.
 KINDS = BORDERS, PIXELS, COSTS, TILES, PARTS, FAILURES, ONCE = (

@@ -196,4 +196,4 @@ def test_bound_steps__fit_in_16_bits() -> None:
         return load_config({"disparity": {"minimum": -16000, "maximum": count - 16001}}).bound_steps
 
     assert [steps(count) for count in (1, 1024, 1025, 2048, 32001)] == [64, 64, 32, 32, 2]
-    assert load_config(RANGE | {"preset": "paper"}).bound_steps == 0
+    assert load_config(RANGE | {"preset": "paper"}).bound_steps == 1

@@ -18,7 +18,7 @@ from sat_intervals.match.costs import cost_of
 from sat_intervals.match.patch import Frame, match_patch, patch_areas
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_rows
 from sat_intervals.prepare.in_memory import match_arrays
-from sat_intervals.products import BOUND_STEPS, IMPOSSIBLE_COST, INVALID, NO_DATA, NO_DISPARITY, REJECTED
+from sat_intervals.products import BOUND_STEPS, IMPOSSIBLE_COST, INVALID, NO_BOUND, NO_DATA, NO_DISPARITY, REJECTED
 from sat_intervals.tiling import View, Window
 
 bounded = settings(max_examples=40, derandomize=True, deadline=None)
@@ -53,9 +53,9 @@ def test_match_costs__interval_worked_example():
     #     4 4 4 7     cut -2 0; both ends have the least: -3 is beyond the range, so -2 1
     #     . 2 6 4     cut -1 1, whatever is between; -1 is pushed out, to the impossible -2: -2 1
     raw = of_curves(CURVES, -2)
-    assert raw.lower.tolist() == [[-2], [-2], [-2]]
-    assert raw.upper.tolist() == [[0], [1], [1]]
-    assert (raw.lower.dtype, raw.upper.dtype) == (np.int16, np.int16)
+    assert raw.lower.tolist() == raw.lower_low.tolist() == [[0], [0], [0]]  # counted from -2
+    assert raw.upper.tolist() == raw.upper_low.tolist() == [[2], [3], [3]]
+    assert {bound.dtype for bound in (raw.lower, raw.upper, raw.lower_low, raw.upper_low)} == {np.dtype(np.uint16)}
     lower, upper = reference.alpha_cut(np.array(CURVES)[:, np.newaxis], "0.9", 24, True)
     assert lower.tolist() == [[0], [0], [0]]
     assert upper.tolist() == [[2], [3], [3]]
@@ -72,7 +72,7 @@ def check_against_reference(scene, alpha, refine):
     raw = matched(scene, alpha=alpha, refine=refine)[0]
     bounds = reference.alpha_cut(reference.volume_of(scene), alpha, reference.span_of(scene), refine)
     for bound, expected in zip((raw.lower, raw.upper), bounds, strict=True):
-        np.testing.assert_array_equal(bound, reference.absolute(expected, scene.minimum))
+        np.testing.assert_array_equal(bound, np.where(expected == reference.NONE, NO_BOUND, expected))
 
 
 @pytest.mark.parametrize("count", COUNTS)
@@ -88,12 +88,11 @@ def test_match_costs__interval_equals_reference_at_every_count(count, data):
 def test_match_costs__interval_holds_the_disparity(scene, refine, alpha):
     raw = matched(scene, refine=refine, alpha=alpha)[0]
     found = raw.winner != N
-    assert (raw.lower[found] <= raw.disparity[found]).all()
-    assert (raw.disparity[found] <= raw.upper[found]).all()
-    assert (raw.lower[~found] == N).all()
-    assert (raw.upper[~found] == N).all()
-    assert (raw.lower[found] >= scene.minimum).all()
-    assert (raw.upper[found] <= scene.minimum + scene.count - 1).all()
+    assert (raw.lower[found] <= raw.disparity[found] - scene.minimum).all()
+    assert (raw.disparity[found] - scene.minimum <= raw.upper[found]).all()
+    assert (raw.lower[~found] == NO_BOUND).all()
+    assert (raw.upper[~found] == NO_BOUND).all()
+    assert (raw.upper[found] <= scene.count - 1).all()
 
 
 # ---- Sub-pixel cuts ----------------------------------------------------------------------------------------
@@ -105,7 +104,6 @@ def test_match_costs__subpixel_cut_worked_example():
     raw = of_curves(CURVES, -2, refine=False, cuts=(2.5, 0.0), steps=64)
     assert raw.lower.tolist() == [[37], [0], [64]]
     assert raw.upper.tolist() == [[136], [182], [192]]
-    assert raw.lower.dtype == np.uint16
     # Level 0 is the winner, ties included; with refinement the V-fit (1 + 1 / 3, 0.5, unrefined) is inside.
     assert raw.lower_low.tolist() == [[64], [0], [64]]
     assert raw.upper_low.tolist() == [[64], [128], [64]]
@@ -312,7 +310,7 @@ def check(bands, validity, expected, config):
 
     A quantile close to a multiple of 1/64 px may be rounded outwards to the next one.
     """
-    step = 1e-6 if config.bound_steps == 0 else 1 / BOUND_STEPS
+    step = 1e-6 if config.bound_steps == 1 else 1 / BOUND_STEPS
     disparity, lower, upper, confidence = bands
     np.testing.assert_array_equal(validity, expected.validity)
     np.testing.assert_array_equal(disparity, expected.disparity)

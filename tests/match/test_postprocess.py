@@ -21,13 +21,15 @@ def raw_rows() -> RawRows:
     """Noise with areas of low confidence and pixels without disparity."""
     random = np.random.default_rng(0)
     winner = random.integers(MINIMUM + 2, MINIMUM + COUNT - 2, (ROWS, COLUMNS)).astype(np.int16)
-    lower, upper = winner - random.integers(0, 3, winner.shape), winner + random.integers(0, 3, winner.shape)
+    lower, upper = (
+        (winner - MINIMUM + sign * random.integers(0, 3, winner.shape)).astype(np.uint16) for sign in (-1, 1)
+    )
     disparity = (winner + random.uniform(-0.5, 0.5, winner.shape)).astype(np.float32)
     right = random.integers(MINIMUM, MINIMUM + COUNT, (ROWS, COLUMNS + COUNT - 1)).astype(np.int16)
     ambiguity = random.integers(0, 60, winner.shape).astype(np.uint32)
     winner[random.random(winner.shape) < 0.05] = NO_DISPARITY
     validity = np.where(winner == NO_DISPARITY, 4, 0).astype(np.uint16)
-    return RawRows(winner, lower.astype(np.int16), upper.astype(np.int16), disparity, ambiguity, validity, right)
+    return RawRows(winner, lower, upper, disparity, ambiguity, validity, lower, upper, right)
 
 
 @pytest.mark.parametrize("sections", [{}, {"median": {"size": 7}, "regularization": {"depth": 4}}, {"median": None}])

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import reference
 import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
@@ -9,7 +10,7 @@ from volumes import softmax, volume_of
 
 from sat_intervals import SatIntervalsError, intervals_of, load_config, match_arrays
 from sat_intervals.demo import make_scene
-from sat_intervals.kernels.curves import read_alpha_cuts, read_right_winners, read_winners
+from sat_intervals.kernels.curves import read_right_winners
 from sat_intervals.kernels.disparity import cross_check
 from sat_intervals.products import IMPOSSIBLE_COST, INVALID, MISMATCH, NO_CANDIDATE, OCCLUSION
 
@@ -76,15 +77,16 @@ def test_intervals_of__reads_curves_as_the_slow_twin(seed, count, impossible):
     config = load_config({"preset": "paper", "disparity": {"minimum": -4, "maximum": count - 5}} | RAW)
     etas = np.arange(70) / 100 * 110
     weights = (70 - np.searchsorted(np.floor(etas + 1e-9), np.arange(111))).astype(np.uint16)
-    _, disparity, ambiguity = read_winners(volume, -4, weights, True)
+    above = np.where(np.isnan(values), 0, volume - volume.min(axis=2, keepdims=True))
+    disparity, _ = reference.vfit(volume.astype(int), reference.winner_takes_all(volume), -4)
     impossible = np.isnan(values).sum(axis=2)
     known = np.isfinite(disparity)
     np.testing.assert_array_equal(found["disparity"], disparity)
-    ambiguous = ambiguity[known] / config.largest_ambiguity
+    ambiguous = weights[above].sum(axis=2)[known] / config.largest_ambiguity
     np.testing.assert_allclose(found["confidence"].data[known], 1 - ambiguous, atol=1e-6)
-    bounds = read_alpha_cuts(volume, -4, 11, True)
+    bounds = reference.alpha_cut(volume, "0.9", 110, True)
     for name, bound in zip(("lower", "upper"), bounds, strict=True):
-        np.testing.assert_array_equal(found[name].data[known], bound[known])
+        np.testing.assert_array_equal(found[name].data[known], bound[known] - 4)
     np.testing.assert_array_equal(found["validity"].data & INVALID, np.where(known, 0, NO_CANDIDATE))
     np.testing.assert_array_equal(found["validity"].data & 4 != 0, known & (impossible > 0))
 
@@ -138,8 +140,7 @@ def test_intervals_of__takes_fractions_of_pixels(step):
     every, last = round(1 / step), int(24 * step)
     costs = np.where(np.isnan(values), IMPOSSIBLE_COST, values).astype(np.uint16)
     right = read_right_winners(costs[:, :, ::every], 0)
-    winner = read_winners(costs, 0, np.zeros(0, np.uint16), False)[0]
-    winner = np.clip(np.floor(step * winner + 0.5), 0, last).astype(np.int16)
+    winner = np.clip(np.floor(step * costs.argmin(axis=2) + 0.5), 0, last).astype(np.int16)
     np.testing.assert_array_equal(
         checked["validity"].data & (OCCLUSION | MISMATCH), cross_check(winner, right, 0, PAPER.cross_check.tolerance)
     )
@@ -224,7 +225,6 @@ REFUSED = {
         lambda: (softmax(ARRAY, 1), range(6), {"kind": "probability", "span": None, "config": {"sgm": True}}),
         "sgm is given with probabilities",
     ),
-    "dimensions": (lambda: (xr.DataArray(ARRAY, dims=("a", "b", "c")), None, {}), "give row, col and disp"),
     "penalties": (
         lambda: (ARRAY, range(6), {"config": {"sgm": {"penalty": "mc_cnn_fast", "p1": 5, "p2": 33, "span": 90}}}),
         "sgm.penalty is mc_cnn_fast, allowed: constant with cost.method volume",
@@ -233,6 +233,7 @@ REFUSED = {
         lambda: (ARRAY, range(6), {"config": {"sgm": {"p2": 1e6}}}),
         "sgm.p2 is 1000000.0, allowed: <= 90090 with cost.method volume, so that costs summed over 8 paths fit",
     ),
+    "dimensions": (lambda: (xr.DataArray(ARRAY, dims=("a", "b", "c")), None, {}), "give row, col and disp"),
     "dataset": (lambda: (xr.Dataset({"costs": 1}), None, {}), "has costs, but no cost_volume"),
 }
 

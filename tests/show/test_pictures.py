@@ -338,7 +338,7 @@ def test_draw_curve__says_why_the_interval_is_wider_than_the_cut(run, tmp_path, 
     inside = curve.disparities[curve.cut]
     assert (curve.lower, curve.upper) != (inside.min(), inside.max())
     draw_curve(open_results(run), tmp_path / "curve.png", 60, 90, dpi=50)
-    assert f"interval, {curve.lower} to {curve.upper} px:\ncut pushed out by refinement" in words
+    assert f"interval, {curve.lower:g} to {curve.upper:g} px:\ncut pushed out by refinement" in words
 
 
 def test_read_curve__is_the_curve_of_the_run(run):
