@@ -60,10 +60,7 @@ def plan(
     config = resolved(load_config(config))
     left, right = checked_pair(left, right, config)
     region = checked_region(left, window)
-    no_rows = config.model_copy(update={"rows": "none"})
-    with each_here(progress) as each:
-        searched = prepare(FilePair(left, right), no_rows, each, region=window, looks=False).config
-    config = config.model_copy(update={"disparity": searched.disparity})
+    config = _searched(FilePair(left, right), config, progress)
     config = fitted_to_jobs(config) if memory is None else fitted(config, memory, waiting=readers(config.cluster))
     workers = workers or tiles_at_once(config.cluster)
     strip = min(BLOCK, region.height), region.width
@@ -94,6 +91,13 @@ def plan(
         + handed_bytes(grid, config, (left, right), keeps_pixels=not is_remote(config.cluster)),
         seconds=seconds,
     )
+
+
+def _searched(pair: FilePair, config: Config, progress: Progress) -> Config:
+    """Return the settings with the search range as numbers; rows are not looked at."""
+    with each_here(progress) as each:
+        found = prepare(pair, config.model_copy(update={"rows": "none"}), each, looks=False)
+    return config.model_copy(update={"disparity": found.config.disparity})
 
 
 def _work(grid: Grid, config: Config) -> int:
