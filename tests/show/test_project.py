@@ -15,7 +15,6 @@ from finished import PLACE, no_bands, random_bands, without_intervals, write_run
 from helpers import invoke
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
-from surfaces import write_raster
 
 from sat_intervals.products import INVALID
 from sat_intervals.show.legend import PIXEL_CLASSES, classify
@@ -109,15 +108,6 @@ def test_write_project__leaves_out_what_is_missing_or_of_another_run(run):
     assert "the right image is left out: " in done.stderr
     names = [name for _, name, _ in layers_of(read_project(out))]
     assert names == ["validity", "confidence", "interval width", "disparity", "truth", "left"]
-
-
-def test_write_project__leaves_out_the_truth_beside_another_image(run):
-    out, _, _ = run
-    write_raster(out.parent / "left.tif", np.ones((1, 9, 9)), PLACE.transform)
-    done = invoke("project", out)
-    assert done.exit_code == 0
-    for name in ("left", "truth"):
-        assert re.search(f"the {name} image is left out: .*left.tif has 9 x 9 pixels, but had 60 x 80", done.stderr)
 
 
 def test_write_project__of_a_run_without_intervals_and_without_valid_pixels(tmp_path):
