@@ -57,7 +57,7 @@ def blocks_of_points(run: Run, lattice: Lattice, places: np.ndarray, pixel: floa
     counts = np.bincount(numbers.ravel(), minlength=len(groups))
     parts = []
     for group in np.argsort(-counts, kind="stable")[: ACROSS**2]:
-        x, y, height = places[numbers.ravel() == group][: 4 * POINTS].T
+        x, y, height = places[numbers.ravel() == group][:POINTS].T
         cells = _around(x, y, pixel)
         gathered, _ = cloud.splat(cells, Window(0, 0, cells.rows, cells.columns), pixel, threading.Event())
         parts.append((mean_heights(gathered), *_in_cells(cells, x, y), height))

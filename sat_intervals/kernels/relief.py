@@ -1,9 +1,9 @@
-"""Heights and slopes of surfaces of blocks at points.
+"""Heights of surfaces of blocks at points, and how well they fit.
 
 A surface is ``(blocks, rows, columns)``, NaN where unknown; points are ``(n,)`` block, column x and row y there, where
 centres of cells are integers.
 
-Letters: n a point; i, j row and column of a cell.
+Letters: n a point; i, j row and column of a cell; a, b a shift.
 """
 
 import numpy as np
@@ -11,55 +11,46 @@ import numpy as np
 from sat_intervals.kernels.compiled import cached, part
 
 
-@cached
-def slopes(surface, block, x, y, reach):
-    """Return ``(n, 2)`` slopes of the nearest cells, down the rows and along the columns; NaN where unknown.
-
-    They are means of three lines, over ``reach`` cells to each side.
-    """
-    result = np.full((x.size, 2), np.nan)
-    _, rows, columns = surface.shape
-    for n in range(x.size):
-        i, j = int(np.floor(y[n] + 0.5)), int(np.floor(x[n] + 0.5))
-        if reach <= i < rows - reach and reach <= j < columns - reach:
-            here = surface[block[n]]
-            down = across = 0.0
-            for k in range(-1, 2):
-                down += here[i + reach, j + k] - here[i - reach, j + k]
-                across += here[i + k, j + reach] - here[i + k, j - reach]
-            result[n] = down / (6 * reach), across / (6 * reach)
-    return result
-
-
 @part
-def bend(here, i, j, down, across):
-    """Return how far a cell is from the middle between two opposite neighbours, twice."""
-    return abs(here[i - down, j - across] + here[i + down, j + across] - 2 * here[i, j])
+def between(here, i, j, down, across):
+    """Return the height between a cell and the next ones (bilinear), without those that have no part in it."""
+    upper, lower = here[i, j], 0.0
+    if across > 0:
+        upper += across * (here[i, j + 1] - upper)
+    if down > 0:
+        lower = here[i + 1, j]
+        if across > 0:
+            lower += across * (here[i + 1, j + 1] - lower)
+        upper += down * (lower - upper)
+    return upper
 
 
 @cached
-def interpolated(surface, block, x, y):
-    """Return ``(n, 4)`` heights between cells (bilinear), lowest and highest of the nine cells around, and their bend.
+def losses(surface, block, x, y, height, east, north, cap):
+    """Return ``(blocks, east, north)`` sums over points of ``min((d - median d)^2, cap^2)``, and numbers of points.
 
-    Between lowest and highest, a point may be a wall that is moved by a cell; beyond them something has changed. Bends
-    are twice the largest distance from a plane. NaN where unknown.
+    ``d`` are differences of height to the surface moved by whole cells, to each of ``east`` and of ``north``: of a
+    point, weights of cells are the same for all shifts, and so is the noise of the surface.
     """
-    result = np.full((x.size, 4), np.nan)
-    _, rows, columns = surface.shape
-    for n in range(x.size):
-        i, j = int(np.floor(y[n] + 0.5)), int(np.floor(x[n] + 0.5))
-        if 1 <= i < rows - 1 and 1 <= j < columns - 1:
-            here = surface[block[n]]
-            down, across = y[n] - i, x[n] - j
-            below, beside = i + (1 if down > 0 else -1), j + (1 if across > 0 else -1)
-            down, across = abs(down), abs(across)
-            result[n, 0] = (1 - down) * ((1 - across) * here[i, j] + across * here[i, beside])
-            result[n, 0] += down * ((1 - across) * here[below, j] + across * here[below, beside])
-            around = here[i - 1 : i + 2, j - 1 : j + 2]
-            result[n, 1], result[n, 2] = around.min(), around.max()
-            bends = bend(here, i, j, 0, 1), bend(here, i, j, 1, 0), bend(here, i, j, 1, 1), bend(here, i, j, 1, -1)
-            result[n, 3] = max(bends)
-    return result
+    blocks, rows, columns = surface.shape
+    sums, counts = np.zeros((2, blocks, east.size, north.size))
+    differences, known = np.empty(x.size), np.empty(x.size, np.int64)
+    for a in range(east.size):
+        for b in range(north.size):
+            count = 0
+            for n in range(x.size):
+                row, column = int(np.floor(y[n])), int(np.floor(x[n]))
+                i, j = row + north[b], column - east[a]
+                if 0 <= i < rows - 1 and 0 <= j < columns - 1:
+                    difference = height[n] - between(surface[block[n]], i, j, y[n] - row, x[n] - column)
+                    if not np.isnan(difference):
+                        differences[count], known[count] = difference, block[n]
+                        count += 1
+            middle = np.median(differences[:count]) if count else 0.0
+            for n in range(count):
+                sums[known[n], a, b] += min((differences[n] - middle) ** 2, cap**2)
+                counts[known[n], a, b] += 1
+    return sums, counts
 
 
 @part

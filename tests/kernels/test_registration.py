@@ -68,16 +68,6 @@ def test_register__finds_a_shift(heights_at, within, moves):
     assert np.std(found.after) < np.std(found.before)
 
 
-def test_register__states_its_uncertainty():
-    found = [register(blocks_of(hills, (3.0, -2.0, 5.0), noise=0.2, seed=seed)) for seed in range(4)]
-    errors = np.array([one.shift - (3, -2, 5) for one in found])
-    stated = np.array([one.deviation for one in found])
-    assert np.abs(errors).max() < 0.15
-    ratio = np.sqrt((errors**2).mean(axis=0) / (stated**2).mean(axis=0))
-    assert (ratio < 3).all()
-    assert (ratio > 0.2).all()
-
-
 def test_register__noise_does_not_move_aligned_surfaces():
     """Nothing is moved, and differences stay as they are: the noise is not averaged away."""
     found = [register(blocks_of(hills, (0.0, 0.0, 0.0), noise=0.7, seed=seed, aligned=True)) for seed in range(4)]
@@ -88,22 +78,25 @@ def test_register__noise_does_not_move_aligned_surfaces():
         assert np.std(one.after) == pytest.approx(0.7 * np.sqrt(2), rel=0.05)
 
 
-@pytest.mark.parametrize("aligned", [True, False])
+def errors_and_deviations(heights_at, kinds):
+    """Those of horizontal shifts, in cells: ``kinds`` are noise (m), its width and the shift (cells), and alignment."""
+    found = []
+    for seed, (noise, wide, cells, aligned) in enumerate(kinds):
+        shift = CELL * np.array([cells, -cells])
+        blocks = blocks_of(heights_at, (*shift, 1.0), 1, noise, 500, 16, seed, aligned, wide)
+        place, deviation = registration._horizontal(blocks)
+        found.append([place - shift, deviation])
+    return np.array(found).swapaxes(0, 1) / CELL
+
+
 @pytest.mark.parametrize("heights_at", [houses, hills, mountains])
-def test_register__deviations_cover_shifts_below_a_cell(heights_at, aligned):
-    """Without bias, and in about 9 of 10 trials at .9, under white noise and noise as wide as three cells."""
-    errors, deviations = [], []
-    for seed in range(12):
-        shift = CELL * np.array([3.7, -3.7] if seed % 2 else [0.25, -0.25])
-        noise = {"noise": 0.5, "wide": (1, 3)[seed // 2 % 2]}
-        blocks = blocks_of(heights_at, (*shift, 1.0), number=16, seed=seed, aligned=aligned, **noise)
-        found, deviation = registration._with_deviation(blocks, CELL * np.rint(shift / CELL))
-        errors.append(found[:2] - shift)
-        deviations.append(deviation[:2])
-    inside = np.abs(errors) <= 1.645 * np.array(deviations)
-    assert inside.mean() >= 0.75
-    assert np.abs(np.mean(errors, axis=0)).max() < 0.05 * CELL
-    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.sqrt(np.mean(np.square(deviations))), rel=0.5)
+def test_register__deviations_hold(heights_at):
+    """Without bias, and in about 9 of 10 trials at .9, of all kinds of noise; `benchmarks/registration.py` has more."""
+    kinds = [(noise, wide, cells, wide == 1) for noise in (0.1, 0.7) for wide in (1, 3) for cells in (0.25, 3.7)]
+    errors, deviations = errors_and_deviations(heights_at, kinds)
+    assert (np.abs(errors) <= 1.645 * deviations).mean() >= 0.75
+    assert np.abs(errors.mean(axis=0)).max() < 0.06
+    assert np.sqrt((errors**2).mean()) == pytest.approx(np.sqrt((deviations**2).mean()), rel=0.5)
 
 
 @pytest.mark.parametrize("aligned", [True, False])
@@ -116,17 +109,23 @@ def test_register__noise_stays_as_it_is_in_towns(aligned, cells):
     assert summary(found.after)["nmad"] == pytest.approx(0.1 * np.sqrt(2), rel=0.07)
 
 
-def test_register__walls_to_one_side_move_nothing_where_the_ground_has_relief():
-    """Surfaces of stereo have walls a cell too far to one side."""
-    blocks = blocks_of(lambda x, y: hills(x, y) + houses(x, y), (0.0, 0.0, 0.0), noise=0.1, number=16)
-    grown = np.maximum(blocks.surface, np.roll(blocks.surface, -1, axis=2))
-    wall = grown - blocks.surface > 2
-    found = register(blocks._replace(surface=np.where(wall, grown, blocks.surface)))
-    assert np.abs(found.shift[:2]).max() < 0.1 * CELL
+@pytest.mark.parametrize("seed", [0, 2])
+def test_register__finds_a_town_where_most_heights_are_wrong(seed):
+    """Patches of 6 m in which walls and roofs were matched wrongly: the rest decides."""
+    shift = (0.85, -1.4, 1.0)
+    blocks = blocks_of(houses, shift, 1, 0.3, 500, 16, seed, wide=3)
+    random = np.random.default_rng(seed)
+    patch = (np.floor(blocks.x / 12) + 20 * np.floor(blocks.y / 12) + 400 * blocks.block).astype(int)
+    wrong = random.random(patch.max() + 1) < 0.7
+    errors = np.where(wrong, random.normal(0, 15, wrong.size), 0.0)
+    found = register(blocks._replace(height=blocks.height + errors[patch]))
+    assert found.is_horizontal
+    np.testing.assert_allclose(found.shift[:2], shift[:2], atol=0.3 * CELL)
+    assert (np.abs(found.shift - shift) <= 3 * found.deviation).all()
 
 
 def test_register__a_block_never_decides_alone():
-    """Of the others, strips are known, too narrow for the widest slopes."""
+    """Of the others, strips are known."""
     blocks = blocks_of(hills, (0.5, 0.0, 1.0))
     surface = blocks.surface.copy()
     surface[1:, :, np.arange(surface.shape[2]) % 24 >= 12] = np.nan
@@ -134,12 +133,12 @@ def test_register__a_block_never_decides_alone():
     np.testing.assert_allclose(found.shift, (0.5, 0, 1), atol=0.05)
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.3])
-def test_register__refuses_the_horizontal_part_on_a_plane(noise):
-    found = register(blocks_of(plane, (0.0, 0.0, 5.0), noise=noise))
+@pytest.mark.parametrize(("noise", "wide"), [(0.0, 1), (0.3, 1), (1.0, 3)])
+def test_register__refuses_the_horizontal_part_on_a_plane(noise, wide):
+    found = register(blocks_of(plane, (0.0, 0.0, 5.0), noise=noise, wide=wide))
     assert not found.is_horizontal
     assert np.isnan(found.deviation[:2]).all()
-    np.testing.assert_allclose(found.shift, (0, 0, 5), atol=0.05)
+    np.testing.assert_allclose(found.shift, (0, 0, 5), atol=0.1)
 
 
 def test_register__refuses_a_shift_beyond_its_reach():
