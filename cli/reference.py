@@ -21,8 +21,8 @@ from sat_intervals.cli.options import (
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
 
-# Metres of height above which a shift is rather a mistake, and pixels of row misfit.
-_SUSPECT_HEIGHT, _SUSPECT_ROWS = 10.0, 0.5
+# Pixels of row misfit above which it is rather a mistake.
+_SUSPECT_ROWS = 0.5
 
 
 @click.command(short_help="Turn reference heights into true disparities of a run.")
@@ -81,7 +81,7 @@ def reference(
     with Console(quiet or as_json) as console:
         note_geometry([out], sensor_files)
         report = make_truth(out, given, path=output, registers=not no_register, progress=console.progress)
-    _say_fit(console, report)
+    _say_fit(console, out, given.path, report)
     console.say(
         f"{report['pixels']} pixels with a true disparity ({100 * report['share']:.1f} %), "
         f"{100 * report['outside_range']:.1f} % of them outside the search range"
@@ -91,16 +91,15 @@ def reference(
         say_json(report)
 
 
-def _say_fit(console: "Console", report: dict[str, Any]) -> None:
+def _say_fit(console: "Console", out: Path, heights: Path, report: dict[str, Any]) -> None:
     """Print the registration and the misfit of rows; warn of those that are suspect."""
     from sat_intervals.cli.tables import registration_lines
+    from sat_intervals.raster.surfaces import datum_warnings
 
     if report["registration"]:
         for line in registration_lines(report["registration"]):
             console.say(line)
-        up = report["registration"]["shift"][2]
-        if abs(up) > _SUSPECT_HEIGHT:
-            warn([f"the reference was moved by {up:.1f} m in height: check what its heights refer to"])
+        warn(datum_warnings(out, heights, report["registration"]["shift"][2]))
     misfit = report["row_misfit"]
     if misfit:
         console.say(f"row misfit of models and grids: {misfit[0]:.2g} px in the median, {misfit[1]:.2g} px at most")

@@ -23,8 +23,6 @@ from sat_intervals.raster import read_tags
 _MOST = 1 << 20
 # Classes with the same number of cells, fewer with few cells; blocks along each side of the ground.
 _CLASSES, _BLOCKS = (8, 4, 2, 1), 4
-# Metres: a larger median difference is another datum, not an error.
-_DATUM = 10.0
 
 
 class Margins(NamedTuple):
@@ -136,16 +134,10 @@ def _part(place: np.ndarray) -> np.ndarray:
 def _datum_warnings(given: Comparison, sample: Heights) -> list[str]:
     """Return a warning if the heights differ by as much as two datums do; raise if the reference was not moved."""
     median = float(np.median(sample.height - sample.reference)) + given.shift[2] if sample.height.size else None
-    check_common(given, sample.height.size, median)
-    if median is None or abs(median) <= _DATUM:
-        return []
-    line = (
-        f"heights of {given.surface} and {given.reference} differ by {median:.1f} m in the median, as heights "
-        "above a geoid and heights above the ellipsoid do"
-    )
-    if given.registration:
-        return [f"{line}; the margins do not include it"]
-    raise SatIntervalsError(f"{line}: make the surface with --geoid, convert the reference, or leave out --no-register")
+    warnings = check_common(given, sample.height.size, median)
+    if warnings and not given.registration:
+        raise SatIntervalsError(f"{warnings[0]}, make the surface with --geoid, or leave out --no-register")
+    return warnings
 
 
 def fitted(sample: Heights, cells_of_height: float, coverage: float) -> Margins | None:

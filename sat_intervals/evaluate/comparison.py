@@ -16,6 +16,7 @@ from sat_intervals.raster import (
     Georeferencing,
     check_reference,
     covered_window,
+    datum_warnings,
     is_surface,
     read_heights,
     read_layers,
@@ -112,8 +113,11 @@ def open_comparison(
     return Comparison(surface, reference, shape, place, resolution, finer, registration)
 
 
-def check_common(given: Comparison, count: int, median: float | None) -> None:
-    """Raise without a common height, or if they differ too much; ``median`` is that of height - reference."""
+def check_common(given: Comparison, count: int, median: float | None) -> list[str]:
+    """Warn of another datum; raise without a common height, or if they differ too much.
+
+    ``median`` is that of height - reference.
+    """
     if not count or median is None:
         raise SatIntervalsError(
             f"no cell of {given.surface} has a height in {given.reference}: give a reference of the same place"
@@ -123,6 +127,7 @@ def check_common(given: Comparison, count: int, median: float | None) -> None:
             f"the heights of {given.surface} and {given.reference} differ by {LARGEST} m or more in the median: check "
             "that both are metres above the same datum"
         )
+    return datum_warnings(given.surface, given.reference, median)
 
 
 def tiles(given: Comparison) -> Iterator[Window]:

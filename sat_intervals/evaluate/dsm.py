@@ -76,7 +76,7 @@ def evaluate_surface(
             before.add(compared(given, window)[0])
     report = whole.report()
     in_place = before.report() if moved is not given else report
-    check_common(given, in_place["count"], in_place["median"])
+    warnings += check_common(given, in_place["count"], in_place["median"])
     coverage = report["coverage"]
     if nominal and coverage is not None and coverage < _POOR * nominal:
         warnings.append(

@@ -18,6 +18,7 @@ from sat_intervals.raster.rpc import find_model, read_rpc_file
 from sat_intervals.raster.surfaces import (
     check_reference,
     covered_window,
+    datum_warnings,
     ground_of,
     is_surface,
     read_heights,
@@ -28,12 +29,12 @@ from sat_intervals.raster.windows import Layer, read_small_image, read_small_lay
 from sat_intervals.raster.writer import OutputWriter
 
 __all__ = [
-    "BLOCK", "GROUND", "RUN_FILES", "ControlPoint", "File", "Frame", "Georeferencing", "HeightRaster", "Image",
-    "Layer", "OutputError", "OutputWriter", "Part", "Projection", "Vertical", "as_json", "between_180", "check_free",
+    "BLOCK", "GROUND", "RUN_FILES", "ControlPoint", "File", "Frame", "Georeferencing", "HeightRaster", "Image", "Layer",
+    "OutputError", "OutputWriter", "Part", "Projection", "Vertical", "as_json", "between_180", "check_free",
     "check_not_replaced", "check_pair", "check_reference", "check_space", "codec_versions", "compressed",
-    "covered_window", "describe", "factors", "file_bytes", "files_of", "find_model", "footprint", "geoid_grid",
-    "grid_mapping", "ground_of", "halved", "horizontal_name", "is_ground", "is_surface", "new_file", "north_up",
-    "open_image", "part_bytes", "points_file", "ranges_file", "read_heights", "read_known", "read_layers",
+    "covered_window", "datum_warnings", "describe", "factors", "file_bytes", "files_of", "find_model", "footprint",
+    "geoid_grid", "grid_mapping", "ground_of", "halved", "horizontal_name", "is_ground", "is_surface", "new_file",
+    "north_up", "open_image", "part_bytes", "points_file", "ranges_file", "read_heights", "read_known", "read_layers",
     "read_place", "read_rpc_file", "read_shape", "read_small_image", "read_small_layers", "read_tags", "read_views",
     "read_window", "resolution_of", "run_files", "surface_file", "tags_beside", "truth_file", "utm_of",
     "warn_of_no_data", "write_layer",

@@ -21,6 +21,8 @@ from sat_intervals.raster.images import opened
 from sat_intervals.tiling import Window
 
 Bounds = tuple[float, float, float, float]
+# Metres: a larger median difference is another datum, not an error.
+_DATUM = 10.0
 
 
 def is_surface(path: Path) -> bool:
@@ -63,6 +65,16 @@ def check_reference(path: Path, surface: Path) -> None:
             f"{path} has heights of {parts[1].name}, {surface} heights {level}: make the surface with --geoid, or "
             "convert the reference to the ellipsoid"
         )
+
+
+def datum_warnings(one: Path, other: Path, median: float) -> list[str]:
+    """Return a warning if the median difference of heights is as large as that of two datums."""
+    if abs(median) <= _DATUM:
+        return []
+    return [
+        f"heights of {one} and {other} differ by {median:.1f} m in the median, as heights above a geoid and heights "
+        "above the ellipsoid do: check what they refer to"
+    ]
 
 
 def resolution_of(path: Path, place: Georeferencing) -> float:

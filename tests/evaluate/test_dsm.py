@@ -98,6 +98,17 @@ def test_evaluate_surface__registers_on_relief_and_says_what_it_moved(tmp_path):
     assert alone["all"] == alone["before"] == report["before"]
 
 
+def test_evaluate_command__warns_of_another_datum(tmp_path):
+    row, column = np.indices((90, 100)).astype(np.float64)
+    truth = relief(row, column)
+    model = write_surface(tmp_path / "dsm.tif", truth, truth - 0.5, truth + 0.5)
+    for away, words in ((31.0, "differ by -31.0 m in the median, as heights above a geoid and"), (-4.0, "")):
+        result = invoke("evaluate", "--dsm", model, "--reference", write_raster(tmp_path / "r.tif", [truth + away]))
+        assert result.exit_code == 0
+        assert ("above a geoid" in result.stdout) == bool(words)
+        assert words in result.stdout
+
+
 def test_evaluate_surface__registers_a_reference_of_a_small_part_of_the_surface(tmp_path, monkeypatch):
     # Of the blocks of 16 cells every third was tried, and none of them is in the reference.
     monkeypatch.setattr("sat_intervals.kernels.registration._LARGEST", 16)

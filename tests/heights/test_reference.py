@@ -406,6 +406,18 @@ def test_reference_command__replaces_a_named_file_with_overwrite_only(relief, tm
     assert invoke("reference", out, *given, "--overwrite").exit_code == 0
 
 
+def test_reference_command__warns_of_another_datum(relief, tmp_path):
+    out, files, _ = relief
+    low = write_heights(tmp_path / "low.tif", on_ground(lambda row, column: hills(row, column) - 25))
+    result = invoke(
+        "reference", out, "--heights", low, "--ellipsoid", "--output", tmp_path / "t.tif", *sensor_words(files)
+    )
+    assert result.exit_code == 0, result.stderr
+    assert (
+        "differ by 25.0 m in the median, as heights above a geoid and heights above the ellipsoid do" in result.stderr
+    )
+
+
 def test_reference_command__a_surface_gives_the_disparities_of_its_run_back(shared_data, tmp_path):
     # a surface of the run itself is no truth, but must come back
     folder, out = shared_data / "dsm_picanteo", tmp_path / "out"
