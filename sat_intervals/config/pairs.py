@@ -176,6 +176,7 @@ def _of_table(file: Path) -> list[Pair]:
     pairs = []
     for place, row in _rows(file, _COLUMNS):
         row = {"name": row["left"], "group": NO_GROUP} | row
+        row |= {key: str(row[key]) for key in ("name", "group")}
         row |= {image: file.parent / row[image] for image in ("left", "right", "truth")}
         pairs.append(_checked(place, Pair, {key: row[key] for key in Pair.__dataclass_fields__ if key in row}))
     return pairs

@@ -68,7 +68,7 @@ def ground_of(left: SensorImage, right: SensorImage) -> tuple[tuple[float, int] 
     found = match_level(images[0], images[1], (-math.ceil(most), math.ceil(most)), _SPECKLE)
     matched = found.kept.sum() / max(1, min(np.isfinite(image).sum() for image in images))
     if matched < _FEWEST:
-        return None, 0.0
+        return None, float(matched)
     low, high = np.quantile(found.disparity[found.kept], [_BEYOND, 1 - _BEYOND])
     height = round(float(middle - (low + high) / 2 * step / base))
     return (height, math.ceil(_HALF * (high - low) * step)), float(matched)

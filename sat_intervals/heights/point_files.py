@@ -1,6 +1,7 @@
 """Read points with heights in parts: CSV and Parquet (pyarrow), vector files (pyogrio), LAS and LAZ (laspy)."""
 
 import json
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -94,7 +95,7 @@ def _csv(path: Path, columns: list[str] | None) -> Any:
         first, second = stream.readline(), stream.readline()
     separator = max(",;\t", key=first.count)
     numbers = {name: float64() for name in columns or () if name.strip().lower() not in _GEOMETRIES}
-    point = "," if separator == ";" and "," in second else "."
+    point = "," if separator == ";" and re.search(r"(^|;)\s*-?\d+,\d+\s*(;|$)", second) else "."
     options = csv.ConvertOptions(include_columns=columns, column_types=numbers, decimal_point=point)
     reading = csv.ReadOptions(use_threads=False)  # so that errors name the line
     return csv.open_csv(path, reading, csv.ParseOptions(delimiter=separator), options)

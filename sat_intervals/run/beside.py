@@ -20,7 +20,7 @@ compile_postprocessing(Config.model_validate_json(sys.argv[1]))
 @contextmanager
 def compiled_beside(config: Config) -> Iterator[None]:
     """Without compiled kernels, let a second process compile those after matching while the block runs."""
-    cache = median.stats.cache_path  # of this installation and our kernels alone
+    cache = getattr(getattr(median, "stats", None), "cache_path", None)  # of this installation and our kernels alone
     if cache is None or any(Path(cache).glob("*.nbi")):
         yield
         return

@@ -181,9 +181,9 @@ def open_job(
     window: Window | None = None,
     overwrite: bool = False,
     pair: str = "",
-    each: Each | None = None,
+    each: Each = here,
 ) -> Job:
-    """Check all that can be checked before tiles are matched, and prepare the pair; without ``each`` as given."""
+    """Check all that can be checked before tiles are matched, and prepare the pair."""
     config, out = resolved(load_config(config)), Path(out)
     requested = config.disparity.model_dump(mode="json")
     images = checked_pair(left, right, config)
@@ -196,7 +196,7 @@ def open_job(
         before = read_manifest(home_of(out)) or read_report(out) or {}
     inputs = describe_inputs(*images, config, identities(absolute_in(out, before.get("inputs", {}))))
     known = _known(out, before, relative_in(out, inputs))
-    prepared = prepare(FilePair(*images), config, each or here, region=window, known=known, looks=each is not None)
+    prepared = prepare(FilePair(*images), config, each, region=window, known=known)
     return job_of(prepared, out, inputs, requested, region, overwrite=overwrite, pair=pair)
 
 

@@ -126,8 +126,8 @@ def _of_subject(
         images = checked_pair(subject.left, subject.right, subject.config)
         each = EachOnWorkers(workers, progress)
         without_cuts = at_levels(subject.config, 0.0, 0.0, None)  # and without local ranges
+        inputs = describe_inputs(*images, without_cuts, {})
         prepared = prepare(FilePair(*images), without_cuts, each, region=subject.window)
-        inputs = describe_inputs(*images, subject.config, {})
         jobs = [_begun(prepared, inputs, subject, rungs, pair, folder / str(pair[1]), stack) for pair in pairs]
         # several tiles of one job keep all workers busy; stores of all jobs at once would fill the disk
         batches = [jobs] if len(jobs[0].store.grid) == 1 else [[job] for job in jobs]

@@ -95,6 +95,8 @@ def plan(
 
 def _searched(pair: FilePair, config: Config, progress: Progress) -> Config:
     """Return the settings with the search range as numbers; rows are not looked at."""
+    if not (config.disparity.is_auto or config.disparity.is_local):
+        return config
     with each_here(progress) as each:
         found = prepare(pair, config.model_copy(update={"rows": "none"}), each, looks=False)
     return config.model_copy(update={"disparity": found.config.disparity})

@@ -46,25 +46,23 @@ def quality_of(job: Job, tables: Tables) -> dict[str, Any]:
 
 
 def _look(left: Image, right: Image, region: Window) -> dict[str, Any]:
-    """Return ``collars``, whether there is ``no_data``, and ``same``, see `quality_of`, by some rows of both images."""
+    """Return ``collars`` and ``same``, see `quality_of`, by some rows of both images."""
     sides = {"left": left, "right": right}
-    lines = {side: _lines(image, region, _ROWS) for side, image in sides.items()}
-    plain = (side for side, image in sides.items() if is_plain(image))
-    collars = {side: collar for side in plain if (collar := _collar(*lines[side]))}
+    lines = {side: _lines(image, region, _ROWS) for side, image in sides.items() if is_plain(image)}
+    collars = {side: collar for side, of_side in lines.items() if (collar := _collar(*of_side))}
     (first, _), (second, state) = (_lines(image, region, 1) for image in sides.values())
     same = bool(first.size and (state == 0).any() and np.array_equal(first, second))
-    has_none = {side: bool((state != 0).any()) for side, (_, state) in lines.items()}
-    return {"collars": collars, "no_data": has_none, "same": same}
+    return {"collars": collars, "same": same}
 
 
 def doubts_of_images(left: Image, right: Image, looked: Mapping[str, Any] | None = None) -> list[str]:
-    """Return warnings of equal images, and of no data that is not declared or that no pixel is; by default look."""
+    """Return warnings of equal images, and of no data that is not declared or, of a run, that no pixel is."""
     looked = looked or _look(left, right, Window(0, 0, max(left.height, right.height), max(left.width, right.width)))
     lines = collar_lines(looked["collars"], (left.path, right.path))
     if looked["same"]:
         lines.insert(0, f"{left.path} and {right.path} have the same pixels: give the left and the right image")
     given = [(side, image) for side, image in (("left", left), ("right", right)) if image.nodata_given]
-    if given and not any(looked["no_data"][side] for side, _ in given):
+    if given and "no_data" in looked and not any(looked["no_data"][side] for side, _ in given):
         path, nodata = given[0][1].path, given[0][1].nodata
         lines.append(f"{path}: no pixel that was read is {nodata:.9g}, the no-data value given: check it")
     return lines

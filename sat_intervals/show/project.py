@@ -122,7 +122,7 @@ def _surface(run: Run) -> Iterator[Layer]:
 
 
 def _images(run: Run) -> Iterator[Layer]:
-    """Yield truth and images; those that cannot be opened, or were changed since the run, are left out."""
+    """Yield truth and images; those that cannot be opened are left out."""
     for name in ("truth", "left", "right") if run.truth_beside.exists() else ("left", "right"):
         try:
             image = open_input(run.report["inputs"]["left" if name == "truth" else name])
