@@ -1,13 +1,14 @@
 """``sat-intervals batch``: match many pairs on one cluster."""
 
 from pathlib import Path
+from typing import Any
 
 import click
 
 from sat_intervals.cli.logs import warn
 from sat_intervals.cli.matching import RunArguments, SettingsArguments, run_options, settings_options
 from sat_intervals.cli.options import FILE, json_option, say_json
-from sat_intervals.cli.triangulate import geometry_warnings
+from sat_intervals.cli.rectify import say_rectified
 
 
 @click.command(short_help="Match many pairs; a rerun matches the missing ones.")
@@ -25,23 +26,28 @@ def batch(pairs: Path, out: Path, as_json: bool, settings: SettingsArguments, ru
     OUT/batch.json has the state of each pair; the exit status is 1 if any failed.
     """
     from sat_intervals.cli.console import Console
-    from sat_intervals.cli.surface import epipolar_pairs, surfaces_of
     from sat_intervals.config.pairs import REPORT, read_batch
+    from sat_intervals.heights.geometry import geometry_warnings
     from sat_intervals.raster.identity import check_not_replaced
-    from sat_intervals.run.batch import Steps, match_batch
+    from sat_intervals.workflows.batch import match_batch
 
     check_not_replaced([pairs, settings.file], [out / REPORT])
-    rows, doubts = read_batch(pairs), list[str]()
+    doubts: list[str] = []
     with Console(run.quiet or as_json) as console:
+
+        def on_rectified(record: dict[str, Any]) -> None:
+            say_rectified(console, record)
+            doubts.extend(record["warnings"])
+
         report = match_batch(
-            rows,
+            read_batch(pairs),
             out,
             settings.file,
             overrides=settings.sections,
             overwrite=run.overwrite,
             keep_tiles=run.keep_tiles,
             progress=console.progress,
-            steps=Steps(epipolar_pairs(out, console, doubts, overwrite=run.overwrite), surfaces_of(rows, out, console)),
+            on_rectified=on_rectified,
         )
     if as_json:
         say_json(report)

@@ -1,6 +1,5 @@
 """``sat-intervals rectify``: make an epipolar pair of two raw images."""
 
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -83,38 +82,22 @@ def rectify(
     Needs shareloc: pip install 'sat-intervals[dsm]'.
     """  # noqa: D301 (click's mark of a preformatted paragraph)
     from sat_intervals.cli.console import Console
+    from sat_intervals.workflows.rectify import rectify
 
+    left, right = pair.open()
+    raw |= {"left_model": left_model, "right_model": right_model, "geoid": geoid}
     with Console(quiet or as_json) as console:
-        models = left_model, right_model
-        record = rectified(pair, out, models, raw | {"geoid": geoid}, overwrite=overwrite, console=console, rows=True)
+        record = rectify(left, right, out, **raw, overwrite=overwrite, progress=console.progress)
+        say_rectified(console, record)
     if as_json:
         say_json(record)
     for name in ("left.tif", "right.tif", "left_grid.tif", "right_grid.tif", "rectify.json"):
         console.say(str(out / name))
 
 
-def rectified(
-    pair: PairArguments,
-    out: Path,
-    models: tuple[Path | None, Path | None],
-    raw: dict[str, Any],
-    *,
-    overwrite: bool,
-    console: "Console",
-    rows: bool,
-) -> dict[str, Any]:
-    """Rectify a pair and print its figures; ``rows``: compare rows, too. The record gets ``warnings``."""
-    from sat_intervals.heights.epipolar import Terrain
-    from sat_intervals.heights.rectify import RawPair, rectify
-    from sat_intervals.run.quality import doubts_of_images
-    from sat_intervals.run.rows import compared_rows
-
-    left, right = pair.open()
-    terrain = Terrain(raw["dem"], raw["altitude"], raw["geoid"])
-    raw_pair = RawPair(left, right, models, terrain, raw["resolution_of"] or "coarser")
-    compare = partial(compared_rows, progress=console.progress) if rows else None
-    record = rectify(raw_pair, out, overwrite=overwrite, compare=compare, progress=console.progress)
-    warn(doubts := doubts_of_images(left, right))
+def say_rectified(console: "Console", record: dict[str, Any]) -> None:
+    """Print the figures of an epipolar pair, and warnings about its images."""
+    warn(record["warnings"])
     for side in ("left", "right"):
         console.say(f"model of the {side} image: {record['inputs'][f'{side}_model']['path']}")
     height = "a DEM" if record["altitude"] is None else f"{record['altitude']:.0f} m"
@@ -126,4 +109,3 @@ def rectified(
     if found := record["rows"]:
         console.say(f"rows: {found['text']}")
         warn(found["warnings"])
-    return record | {"warnings": doubts}

@@ -21,11 +21,6 @@ from sat_intervals.cli.options import (
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
 
-# Metres between lines of sight above which models are suspect.
-_SUSPECT = 0.1
-# Nodes of a grid beyond the image above which it may be that of another image: CARS adds up to three.
-_MOST_BEYOND = 4
-
 
 @click.command(short_help="Export the points of a run with height bounds.")
 @click.argument("out", type=FILE)
@@ -77,31 +72,12 @@ def triangulate(
 
 def say_geometry(console: "Console", reports: dict[str, Any]) -> None:
     """Print how models and grids of each run fit, and what is wrong with them."""
+    from sat_intervals.heights.geometry import SUSPECT, geometry_warnings
+
     for out, report in reports.items():
-        if report["median_residual"] <= _SUSPECT:
+        if report["median_residual"] <= SUSPECT:
             console.say(
                 f"{out}: lines of sight miss each other by {report['median_residual']:.2g} m in the median (so models "
                 "and grids fit together; neither the matches nor whether they belong to these images is tested)"
             )
     warn(geometry_warnings(reports))
-
-
-def geometry_warnings(reports: dict[str, Any]) -> list[str]:
-    """Return lines about pixels without a point, and models that hardly fit, by the run."""
-    lines = []
-    for out, report in reports.items():
-        if report["lost"]:
-            lines.append(f"{out}: no points in {100 * report['lost']:.2g} %: grids or models have no values there")
-        if report["beyond"] > _MOST_BEYOND * report["grid_step"]:
-            lines.append(
-                f"{out}: the left grid reaches {report['beyond']:.0f} px beyond the left image, more than "
-                f"{_MOST_BEYOND} of its nodes: check that models and grids belong to these images, which must not be "
-                "cropped"
-            )
-        if report["median_residual"] > _SUSPECT:
-            lines.append(
-                f"{out}: lines of sight miss each other by {report['median_residual']:.2g} m in the median, "
-                "where matching models and grids give millimetres. Height errors may be many times larger: check that "
-                "the grids were made with these models"
-            )
-    return lines

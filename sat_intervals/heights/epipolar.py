@@ -56,7 +56,7 @@ class Terrain:
         if self.dem and self.altitude is not None:
             raise SatIntervalsError(f"the DEM {self.dem} and an altitude of {self.altitude:g} m are given: give one")
         if self.geoid and not self.dem:
-            raise SatIntervalsError(f"the geoid {self.geoid} is given without a DEM: leave it out, or give --dem")
+            raise SatIntervalsError(f"the geoid {self.geoid} is given without a DEM: leave it out, or give a DEM")
         for file in filter(None, (self.dem, self.geoid)):
             check_file(file, "give a raster of heights")
 

@@ -23,6 +23,11 @@ FILE = "geometry.json"
 _KINDS = "left_model", "right_model", "left_grid", "right_grid"
 _GIVE = "give left and right models and grids, for each OUT (--left-model, ...; in Python set_geometry)"
 
+# Metres between lines of sight above which models are suspect.
+SUSPECT = 0.1
+# Nodes of a grid beyond the image above which it may be that of another image: CARS adds up to three.
+_MOST_BEYOND = 4
+
 
 @dataclass(frozen=True)
 class Geometry:
@@ -138,3 +143,24 @@ def _beyond(grid: Any, run: Run) -> dict[str, float]:
     ends = zip((rows, columns), (left["height"], left["width"]), strict=True)
     beyond = max(max(float(-nodes[0]), float(nodes[-1]) - (size - 1)) for nodes, size in ends)
     return {"beyond": beyond, "grid_step": float(max(np.diff(rows).max(), np.diff(columns).max()))}
+
+
+def geometry_warnings(reports: dict[str, Any]) -> list[str]:
+    """Return lines about pixels without a point, and models that hardly fit, by the run."""
+    lines = []
+    for out, report in reports.items():
+        if report["lost"]:
+            lines.append(f"{out}: no points in {100 * report['lost']:.2g} %: grids or models have no values there")
+        if report["beyond"] > _MOST_BEYOND * report["grid_step"]:
+            lines.append(
+                f"{out}: the left grid reaches {report['beyond']:.0f} px beyond the left image, more than "
+                f"{_MOST_BEYOND} of its nodes: check that models and grids belong to these images, which must not be "
+                "cropped"
+            )
+        if report["median_residual"] > SUSPECT:
+            lines.append(
+                f"{out}: lines of sight miss each other by {report['median_residual']:.2g} m in the median, "
+                "where matching models and grids give millimetres. Height errors may be many times larger: check that "
+                "the grids were made with these models"
+            )
+    return lines

@@ -45,7 +45,7 @@ class RawPair:
     resolution_of: str = "coarser"
 
 
-def rectify(
+def make_pair(
     pair: RawPair,
     out: Path,
     *,

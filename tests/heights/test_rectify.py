@@ -148,8 +148,11 @@ def test_rectify__is_done_once_and_refuses_other_settings(made, raw, tmp_path):
     refused(["rectify", *raw, made, "--altitude", 20], "settings.altitude was null, now 20.0", "--overwrite")
     epipolar = made / "left.tif", made / "right.tif"
     refused(["rectify", *epipolar, made / "again", "--left-model", raw[0]], "are an epipolar pair already")
-    for words in (("--left-model", raw[0], "--right-model", raw[1]), ("--resolution-of", "left"), ("--altitude", 20)):
-        refused(["surface", *epipolar, made / "again", *words, *SETTINGS], words[0], "is for raw images")
+    models = "--left-model", raw[0], "--right-model", raw[1]
+    wrong = {"a model without a grid": models, "resolution_of": ("--resolution-of", "left")}
+    wrong["altitude"] = "--altitude", 20
+    for name, words in wrong.items():
+        refused(["surface", *epipolar, made / "again", *words, *SETTINGS], f"{name} is for raw images")
     mask = shutil.copy(raw[0], tmp_path / "left_grid.tif")
     refused(["rectify", *raw, tmp_path, "--left-mask", mask, "--overwrite"], "left_grid.tif is an input")
 

@@ -600,7 +600,7 @@ def test_batch_command__a_bad_model_fails_its_pair_only(tmp_path):
     )
     result = invoke("batch", tmp_path / "pairs.csv", tmp_path / "out")
     assert result.exit_code == 1
-    assert result.stderr.startswith(f"bad: there will be no surface: {tmp_path / 'no.tif'}: no such file")
+    assert result.stderr.startswith(f"warning: bad: there will be no surface: {tmp_path / 'no.tif'}: no such file")
     assert "1 of 3 pairs failed" in result.stderr
     assert f"warning: {tmp_path / 'out' / 'near'}: lines of sight miss each other by 0." in result.stderr
     assert f"warning: {tmp_path / 'out' / 'good'}" not in result.stderr

@@ -13,8 +13,8 @@ from rasterio.shutil import copy
 from sat_intervals.config.pairs import PairOfBatch
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.interop.export import export
-from sat_intervals.run.batch import match_batch
 from sat_intervals.run.pair import match_pair
+from sat_intervals.workflows.batch import match_batch
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 

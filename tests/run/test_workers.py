@@ -69,7 +69,7 @@ def test_threads__keep_two_tasks_per_thread_in_flight_and_drop_the_rest_at_the_e
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("module", ["sat_intervals.run.pair", "sat_intervals.run.batch"])
+@pytest.mark.parametrize("module", ["sat_intervals.run.pair", "sat_intervals.workflows.batch"])
 def test_threads__need_neither_dask_nor_xarray(module):
     code = f"import sys, {module}; print(*{{'dask', 'distributed', 'xarray'}} & sys.modules.keys())"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -19,13 +19,13 @@ from sat_intervals.kernels.sgm import LAST
 from sat_intervals.match.memory import fitted, tile_bytes
 from sat_intervals.raster import write_layer
 from sat_intervals.results import open_run
-from sat_intervals.run.batch import Steps, match_batch
 from sat_intervals.run.checks import fitted_to_jobs
 from sat_intervals.run.job import open_job
 from sat_intervals.run.pair import match_jobs, match_pair
 from sat_intervals.run.plan import plan
 from sat_intervals.run.workers import Outcome, parse_memory
 from sat_intervals.store.lock import locked
+from sat_intervals.workflows.batch import match_batch
 
 
 @pytest.fixture(scope="module")
@@ -62,13 +62,11 @@ def test_match_batch__gives_every_pair_what_match_pair_gives(images, tmp_path):
         assert not (tmp_path / "batch" / f"pair{seed}" / "tiles").exists()
 
 
-def test_match_batch__keeps_the_counts_of_a_pair_whose_last_step_fails(images, tmp_path):
-    def finish(pair, finished):
-        raise SatIntervalsError("no model")
-
-    pair = read_batch(rows(images))[0]
-    end = match_batch([pair], tmp_path / "batch", steps=Steps(finish=finish))[pair.name]
-    assert (end["state"], end["error"]) == ("failed", "no model")
+@pytest.mark.peer("shareloc")
+def test_match_batch__keeps_the_counts_of_a_pair_whose_surface_fails(images, tmp_path):
+    pair = replace(read_batch(rows(images))[0], resolution=1.0, sensors=("no.tif",) * 4)
+    end = match_batch([pair], tmp_path / "batch")[pair.name]
+    assert (end["state"], end["error"].partition(":")[0]) == ("failed", "no.tif")
     assert end["counts"] == json.loads((tmp_path / "batch" / pair.name / "run.json").read_text())["counts"]
 
 

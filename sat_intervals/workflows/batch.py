@@ -1,12 +1,11 @@
-"""Match many pairs on one cluster, with tiles of several pairs in flight and a folder for each pair."""
+"""Match many pairs on one cluster, with tiles of several pairs in flight, and make their surface models."""
 
 import logging
 import resource
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,8 @@ from sat_intervals.config import Config, load_config, named_files, read_yaml
 from sat_intervals.config.pairs import REPORT, PairOfBatch
 from sat_intervals.config.presets import merged
 from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.heights.choices import SurfaceChoices
+from sat_intervals.heights.dsm import check_sensors
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, OutputError, files_of, open_image
@@ -36,23 +37,10 @@ from sat_intervals.run.status import read_report
 from sat_intervals.run.workers import Workers
 from sat_intervals.store.lock import locked
 from sat_intervals.tiling import Window
+from sat_intervals.workflows.surface import FILES, Rectified, check_cells, epipolar_pair, has_grids, surface_of
 
 _LOG = logging.getLogger(__name__)
 _KEPT = "finished", "counts", "seconds", "warnings"  # of a run's report, in `batch.json`
-Begin = Callable[[PairOfBatch], PairOfBatch]
-Finish = Callable[[PairOfBatch, str], Mapping[str, Any]]
-
-
-@dataclass(frozen=True)
-class Steps:
-    """What is done with each pair besides matching.
-
-    ``begin`` returns the pair to match, such as that of two raw images. ``finish`` is called with it once it is
-    complete, and the time at which its run ended; what it returns is added to its state.
-    """
-
-    begin: Begin = lambda pair: pair
-    finish: Finish = lambda pair, ended: {}
 
 
 def match_batch(
@@ -64,18 +52,20 @@ def match_batch(
     overwrite: bool = False,
     keep_tiles: bool = False,
     progress: Progress = lambda stage, done, total: None,
-    steps: Steps = Steps(),
+    on_rectified: Rectified = lambda record: None,
 ) -> dict[str, dict[str, Any]]:
     """Match many pairs on one cluster; a failed pair does not stop the others.
 
-    Each pair has a folder in ``out``. ``config`` and ``overrides`` are for all pairs; a pair's own settings win.
-    Returns, as ``batch.json`` has it, by name: ``state`` ("waiting", "done", "done before", "failed"), and ``error`` or
-    ``finished``, ``counts``, ``seconds`` and ``warnings``.
+    Each pair has a folder in ``out``. ``config`` and ``overrides`` are for all pairs; a pair's own settings win. One
+    with a resolution also gets a surface model, its raw images are rectified as by `surface`. Returns, as
+    ``batch.json`` has it, by name: ``state`` ("waiting", "done", "done before", "failed"), and ``error`` or
+    ``finished``, ``counts``, ``seconds``, ``warnings`` and ``surface``, what `make_surface` returns.
     """
     file = Path(config) if isinstance(config, (str, Path)) else None
     sections = read_yaml(Path(config)) if isinstance(config, (str, Path)) else config  # once for all pairs
     common = load_config(sections, overrides, file=file)
     _check_not_replaced(pairs, [file, *named_files(sections), *named_files(overrides)], out)
+    surfaces = _Surfaces(pairs, out, on_rectified, overwrite=overwrite, progress=progress)
     _raise_file_limit()
     with locked(out), ExitStack() as stack:
         report = _Report(out)
@@ -83,28 +73,27 @@ def match_batch(
         with Connection(common.cluster, out) as connection:
             each = EachOnWorkers(connection, progress)
             jobs: dict[str, Job] = {}
-            begun: dict[str, PairOfBatch] = {}
-            for number, given in enumerate(pairs):
+            for number, pair in enumerate(pairs):
                 progress("pairs", number, len(pairs))
                 try:
-                    pair = begun[given.name] = steps.begin(given)
+                    images = surfaces.epipolar(pair, _opened(pair))
                     own = merged(overrides or {}, pair.settings)
                     settings = load_config(sections, own, preset_wins=True, file=file)
-                    job = _prepared(pair, out, settings, overwrite=overwrite, each=each)
+                    job = _job(pair, images, out, settings, overwrite=overwrite, each=each)
                     stack.enter_context(locked(job.out))
                     if job.begin():
                         jobs[pair.name] = job
                     else:
                         report.note({pair.name: _done_before(job, keep_tiles=keep_tiles)})
                 except Exception as error:  # one pair's failure must not stop the others
-                    report.note({given.name: _failed(error)})
+                    report.note({pair.name: _failed(error)})
             progress("pairs", len(pairs), len(pairs))
             for name, how in _matched(jobs, connection, progress, keep_tiles=keep_tiles):
                 report.note({name: how})
-        for pair in begun.values():
-            how = report.states[pair.name]
-            if how["state"] != "failed" and (more := _more(pair, how["finished"], steps.finish)):
-                report.note({pair.name: {**how, **more}})
+        for pair in pairs:
+            state = report.states[pair.name]
+            if pair.resolution and state["state"] != "failed":
+                report.note({pair.name: state | surfaces.made(pair)})
     return report.states
 
 
@@ -133,7 +122,8 @@ def _check_not_replaced(pairs: Sequence[PairOfBatch], others: Sequence[str | Pat
     images = [name for pair in pairs for name in (pair.left, pair.right, pair.left_mask, pair.right_mask)]
     named = [name for pair in pairs for name in (*(pair.sensors or ()), *named_files(pair.settings))]
     read = [file for name in {str(name) for name in (*others, *images, *named) if name} for file in _files(name)]
-    outputs = [out / REPORT, *(folder / name for folder in folders for name in OUTPUTS)]
+    surfaces = [out / pair.name / name for pair in pairs if pair.resolution for name in FILES]
+    outputs = [out / REPORT, *(folder / name for folder in folders for name in OUTPUTS), *surfaces]
     check_not_replaced(read, outputs, [folder / "tiles" for folder in folders])
 
 
@@ -144,18 +134,72 @@ def _files(name: str) -> list[str]:
     return [name]
 
 
-def _prepared(pair: PairOfBatch, out: Path, settings: Config, *, overwrite: bool, each: EachOnWorkers) -> Job:
+def _job(
+    pair: PairOfBatch, images: tuple[Image, Image], out: Path, settings: Config, *, overwrite: bool, each: EachOnWorkers
+) -> Job:
+    return open_job(
+        *images, out / pair.name, settings, window=_window(pair), overwrite=overwrite, pair=pair.name, each=each
+    )
+
+
+class _Surfaces:
+    """The surface models of the pairs with a resolution."""
+
+    def __init__(self, pairs: Sequence[PairOfBatch], out: Path, on_rectified: Rectified, **how: Any) -> None:
+        """Read models and grids, before hours of matching; those that cannot be used fail their pair at its end."""
+        self._out, self._on_rectified, self._how = out, on_rectified, how
+        self._sensors: dict[str, Sequence[Path]] = {}
+        self._errors: dict[str, SatIntervalsError] = {}
+        of_surfaces = [pair for pair in pairs if pair.resolution]
+        if of_surfaces:
+            import sat_intervals.heights.sensors  # noqa: F401 (without its extra it raises, for all pairs)
+        for pair in of_surfaces:
+            try:
+                check_cells(_cells(pair), SurfaceChoices(), None)
+                if has_grids(pair.sensors):
+                    check_sensors(pair.sensors or (), _cells(pair)["resolution"], None)
+            except SatIntervalsError as error:
+                self._errors[pair.name] = error
+                _LOG.warning("%s: there will be no surface: %s", pair.name, error)
+
+    def epipolar(self, pair: PairOfBatch, images: tuple[Image, Image]) -> tuple[Image, Image]:
+        """Return the images to match: those of a pair, or the epipolar pair of its raw images."""
+        if not pair.resolution:
+            return images
+        out, sensors = self._out / pair.name, pair.sensors or ()
+        made = epipolar_pair(*images, out, sensors, _window(pair), self._on_rectified, **self._how)
+        if not has_grids(sensors):
+            check_sensors(made.sensors, pair.resolution, None)
+        self._sensors[pair.name] = made.sensors
+        return made.left, made.right
+
+    def made(self, pair: PairOfBatch) -> dict[str, Any]:
+        """Make the surface of a matched pair; return what it adds to the pair's state."""
+        try:
+            if pair.name in self._errors:
+                raise self._errors[pair.name]
+            out, progress = self._out / pair.name, self._how["progress"]
+            return {"surface": surface_of(out, self._sensors[pair.name], progress, **_cells(pair))}
+        except Exception as error:  # one pair's failure must not stop the others
+            return _failed(error)
+
+
+def _cells(pair: PairOfBatch) -> dict[str, Any]:
+    return {"resolution": pair.resolution, "crs": None, "radius": None}
+
+
+def _opened(pair: PairOfBatch) -> tuple[Image, Image]:
     def opened(side: str, path: str, mask: str | None) -> Image:
         options: dict[str, Any] = {
             name: pair.reading.get(f"{side}_{name}", pair.reading.get(name)) for name in ("band", "nodata")
         }
         return open_image(path, **options, mask=mask)
 
-    left, right = opened("left", pair.left, pair.left_mask), opened("right", pair.right, pair.right_mask)
-    window = Window(*pair.window) if pair.window else None
-    return open_job(
-        left, right, out / pair.name, settings, window=window, overwrite=overwrite, pair=pair.name, each=each
-    )
+    return opened("left", pair.left, pair.left_mask), opened("right", pair.right, pair.right_mask)
+
+
+def _window(pair: PairOfBatch) -> Window | None:
+    return Window(*pair.window) if pair.window else None
 
 
 def _done_before(job: Job, *, keep_tiles: bool) -> dict[str, Any]:
@@ -166,14 +210,6 @@ def _done_before(job: Job, *, keep_tiles: bool) -> dict[str, Any]:
 
 def _failed(error: Exception) -> dict[str, Any]:
     return {"state": "failed", "error": str(error) or type(error).__name__}
-
-
-def _more(pair: PairOfBatch, finished: str, finish: Finish) -> Mapping[str, Any]:
-    """Return what the last step of a pair adds to its state."""
-    try:
-        return finish(pair, finished)
-    except Exception as error:  # one pair's failure must not stop the others
-        return _failed(error)
 
 
 def _raise_file_limit() -> None:

@@ -1,0 +1,75 @@
+"""Make an epipolar pair of two raw images, and compare its rows."""
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from sat_intervals.heights.rectify import RawPair, make_pair
+from sat_intervals.progress import Progress
+from sat_intervals.raster import Image, open_image
+from sat_intervals.run.quality import doubts_of_images
+from sat_intervals.run.rows import compared_rows
+
+
+def rectify(
+    left: str | Path | Image,
+    right: str | Path | Image,
+    out: str | Path,
+    *,
+    left_model: str | Path | None = None,
+    right_model: str | Path | None = None,
+    dem: str | Path | None = None,
+    altitude: float | None = None,
+    geoid: str | Path | None = None,
+    resolution_of: str | None = None,
+    compares_rows: bool = True,
+    overwrite: bool = False,
+    progress: Progress = lambda stage, done, total: None,
+) -> dict[str, Any]:
+    """Resample two raw images to an epipolar pair, with its grids.
+
+    Parameters
+    ----------
+    left, right
+        Paths of raw images, or images opened by `open_image` with a band, a no-data value or a mask.
+    out
+        Folder for ``left.tif``, ``right.tif``, ``left_grid.tif``, ``right_grid.tif`` and ``rectify.json``. What it has
+        of the same inputs and settings is kept.
+    left_model, right_model
+        RPC models, see `set_geometry`; by default those in or beside the images.
+    dem
+        Raster of heights (metres) that have disparity 0.
+    altitude
+        Metres above the ellipsoid that have disparity 0, instead of a DEM; by default the middle of the ground's.
+    geoid
+        Grid of geoid heights that the heights of ``dem`` refer to; by default the ellipsoid.
+    resolution_of
+        Whose pixel size to take if they differ by more than 10 %: ``coarser`` (default) or ``left``.
+    compares_rows
+        Whether to measure how far rows of the pair differ.
+    overwrite
+        Whether a pair in ``out`` that was made otherwise may be replaced.
+    progress
+        Callback, see `Progress`.
+
+    Returns
+    -------
+    The content of ``rectify.json``: ``inputs``, ``settings``, ``altitude`` (metres, None with a DEM),
+    ``base_to_height``, ``metres_per_disparity``, ``pixel_size`` (metres), ``overlap`` (share), ``footprint`` (degrees),
+    ``rows`` (None if they were not compared) and others; and ``warnings``, lines about the images.
+
+    Raises
+    ------
+    SatIntervalsError
+        Images, models or heights cannot be used, or the folder holds a pair made otherwise.
+    """
+    from sat_intervals.heights.epipolar import Terrain  # needs the extra `dsm`
+
+    left, right = (one if isinstance(one, Image) else open_image(one) for one in (left, right))
+    dem, geoid, left_model, right_model = (
+        None if file is None else Path(file) for file in (dem, geoid, left_model, right_model)
+    )
+    pair = RawPair(left, right, (left_model, right_model), Terrain(dem, altitude, geoid), resolution_of or "coarser")
+    compare = partial(compared_rows, progress=progress) if compares_rows else None
+    record = make_pair(pair, Path(out), overwrite=overwrite, compare=compare, progress=progress)
+    return record | {"warnings": doubts_of_images(left, right)}

@@ -1,0 +1,162 @@
+"""Two images to a surface model: raw images are rectified, the pair is matched, its points are gridded."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sat_intervals.config import Interval, load_config, resolved
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.heights.choices import SurfaceChoices
+from sat_intervals.heights.dsm import check_sensors, checked_cells, make_surface, surface_tags
+from sat_intervals.heights.geometry import geometry_warnings, set_geometry
+from sat_intervals.heights.rectified import IMAGES, rectified_files
+from sat_intervals.progress import Progress
+from sat_intervals.raster import Image, check_not_replaced, files_of, open_image
+from sat_intervals.run.beside import compiled_beside
+from sat_intervals.run.pair import match_pair
+from sat_intervals.run.state import OUTPUTS
+from sat_intervals.tiling import Window
+from sat_intervals.workflows.rectify import rectify
+
+# What is made of a run, in its folder.
+FILES = "geometry.json", "dsm.tif"
+
+Rectified = Callable[[dict[str, Any]], None]
+"""Called with what `rectify` returns, as soon as raw images are an epipolar pair."""
+
+
+class Epipolar(NamedTuple):
+    """An epipolar pair with its models and grids, and what `rectify` returned if it was made of raw images."""
+
+    left: Image
+    right: Image
+    sensors: tuple[Path, ...]
+    record: dict[str, Any] | None
+
+
+def surface(
+    left: str | Path | Image,
+    right: str | Path | Image,
+    out: str | Path,
+    config: Any = None,
+    *,
+    resolution: float | Path,
+    crs: str | None = None,
+    radius: float | None = None,
+    geoid: str | Path | None = None,
+    choices: SurfaceChoices | None = None,
+    sensors: Sequence[str | Path] = (),
+    dem: str | Path | None = None,
+    altitude: float | None = None,
+    resolution_of: str | None = None,
+    window: Window | None = None,
+    keep_tiles: bool = False,
+    overwrite: bool = False,
+    progress: Progress = lambda stage, done, total: None,
+    on_rectified: Rectified = lambda record: None,
+) -> dict[str, Any]:
+    """Make a surface model with height intervals of two images: `rectify`, `match_pair` and `make_surface` in one.
+
+    To resume, call it again: what is finished with these images and settings is kept, the surface is made again.
+
+    Parameters
+    ----------
+    left, right
+        Raw images with RPC models, which become the epipolar pair ``out/left.tif``, ``out/right.tif``; or an epipolar
+        pair with the models and grids of its raw images. Paths, or images opened by `open_image`.
+    out
+        Folder for the files of all three steps; the surface model is ``out/dsm.tif``.
+    config, window, keep_tiles, overwrite
+        As for `match_pair`; a ``window`` is a region of an epipolar image.
+    resolution, crs, radius, geoid, choices
+        As for `make_surface`.
+    sensors
+        Left and right RPC model and, of an epipolar pair, left and right grid, see `set_geometry`. By default the
+        models that belong to raw images, and what `rectify` has noted of its pair.
+    dem, altitude, resolution_of
+        Of raw images, as for `rectify`; the heights of ``dem`` refer to ``geoid``.
+    progress
+        Callback, see `Progress`.
+    on_rectified
+        Called with what `rectify` returns, as soon as raw images are an epipolar pair.
+
+    Returns
+    -------
+    ``rectify``, ``run`` and ``surface``, what the three steps return, the first None of an epipolar pair; and
+    ``warnings``, lines of all steps.
+
+    Raises
+    ------
+    SatIntervalsError
+        Inputs, settings or output cannot be used; models, grids and cells are checked before matching.
+    RunError
+        Tiles failed; no output was published.
+    """
+    config, out = load_config(config), Path(out)
+    cells = {"resolution": resolution, "crs": crs, "radius": radius, "geoid": geoid and Path(geoid)}
+    choices = choices or SurfaceChoices()
+    check_cells(cells, choices, resolved(config).interval)
+    left, right = (one if isinstance(one, Image) else open_image(one) for one in (left, right))
+    raw = {"dem": dem, "altitude": altitude, "resolution_of": resolution_of, "geoid": geoid if dem else None}
+    how: dict[str, Any] = {"overwrite": overwrite, "progress": progress}
+    pair = epipolar_pair(left, right, out, sensors, window, on_rectified, **raw, **how)
+    grid = files_of(str(resolution)) if isinstance(resolution, Path) else ()
+    read = [file for one in (left, right) for file in (one.path, one.mask)]
+    results = [out / name for name in (*OUTPUTS, *FILES)]
+    check_not_replaced([*read, *pair.sensors, geoid, *grid], results, [out / "tiles"])
+    check_sensors(pair.sensors, resolution, crs)
+    with compiled_beside(config):
+        run = match_pair(pair.left, pair.right, out, config, window=window, keep_tiles=keep_tiles, **how)
+    made = surface_of(out, pair.sensors, progress, **cells, choices=choices)
+    doubts = pair.record["warnings"] if pair.record else []
+    warnings = [*doubts, *run["warnings"], *geometry_warnings(made["geometry"])]
+    return {"rectify": pair.record, "run": run, "surface": made, "warnings": warnings}
+
+
+def check_cells(cells: Mapping[str, Any], choices: SurfaceChoices, interval: Interval | None) -> None:
+    """Raise for cells that the surface cannot have, before hours of matching."""
+    _, cell, _, radius = checked_cells(**cells)
+    surface_tags(["run"], [interval], choices.for_intervals([interval]), cell, radius)
+
+
+def surface_of(out: Path, sensors: Sequence[Path], progress: Progress, **cells: Any) -> dict[str, Any]:
+    """Note the models and grids of a finished run and make its surface; ``cells`` are arguments of `make_surface`."""
+    set_geometry(out, *sensors)
+    return make_surface([out], out / "dsm.tif", **cells, progress=progress)
+
+
+def has_grids(sensors: Sequence[str | Path] | None) -> bool:
+    """Return whether there are grids beside models."""
+    return len(sensors or ()) > len(IMAGES)
+
+
+def epipolar_pair(
+    left: Image,
+    right: Image,
+    out: Path,
+    sensors: Sequence[str | Path],
+    window: Window | None,
+    on_rectified: Rectified,
+    **raw: Any,
+) -> Epipolar:
+    """Return an epipolar pair with its models and grids; raw images are rectified in the folder of the run.
+
+    ``raw`` are further arguments of `rectify`.
+    """
+    files = tuple(map(Path, sensors)) if has_grids(sensors) else rectified_files(left.path, right.path)
+    if files:
+        given = [name for name in ("dem", "altitude", "resolution_of") if raw.get(name) is not None]
+        if sensors and not has_grids(sensors):
+            given.append("a model without a grid")
+        if given:
+            raise SatIntervalsError(f"{given[0]} is for raw images, {left.path} is an epipolar image: leave it out")
+        return Epipolar(left, right, files, None)
+    if window:
+        raise SatIntervalsError("window is a region of an epipolar image: rectify these raw images, then match them")
+    raw |= zip(("left_model", "right_model"), sensors, strict=False)
+    record = rectify(left, right, out, **raw, compares_rows=False)
+    on_rectified(record)
+    left, right = (open_image(out / name) for name in IMAGES)
+    files = rectified_files(left.path, right.path)
+    assert files
+    return Epipolar(left, right, files, record)
