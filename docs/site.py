@@ -193,7 +193,7 @@ def write_pages() -> None:
     (PAGES / "settings-reference.md").write_text(settings_reference())
     (PAGES / "style.css").write_text(STYLE)
     (PAGES / "commands.md").write_text(command_reference())
-    (PAGES / "python.md").write_text(python_reference())
+    (PAGES / "python-reference.md").write_text(python_reference())
 
 
 if __name__ == "__main__":

@@ -79,7 +79,10 @@ def surface_key(tags: Mapping[str, str], cell: float) -> dict[str, str]:
 
 
 def load_height_calibration(path: str | os.PathLike[str]) -> HeightCalibration:
-    """Read and check a calibration of heights."""
+    """Read and check a calibration of heights, a YAML file of ``calibrate --dsm``, for `SurfaceChoices`.
+
+    Raises `SatIntervalsError` if the file cannot be read or is another one.
+    """
     file = Path(path)
     try:
         values = read_mapping(file, f"keys {', '.join(HeightCalibration.model_fields)}")

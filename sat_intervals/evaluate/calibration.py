@@ -38,10 +38,28 @@ def calibrate_surface(
 ) -> HeightCalibration:
     """Find the margins with which the intervals of a surface model contain a share of reference heights.
 
-    Arguments are those of `evaluate_surface`; ``coverage`` is by default that of the surface's runs. The provenance has
-    the files, the shift of the reference, and figures: ``before`` and ``expected``, those of blocks of ground with the
+    Parameters
+    ----------
+    surface
+        File of `make_surface`, made without a calibration and without a largest width.
+    reference, registers
+        As for `evaluate_surface`.
+    name
+        Name of the calibration, which a surface made with it has in its tags.
+    coverage
+        Share of heights to be inside, 0.5 to 0.99; by default that of the surface's runs.
+
+    Returns
+    -------
+    The calibration, for `SurfaceChoices`: ``classes`` have margins in metres, by width. Its ``provenance`` has the
+    files, the shift of the reference, and figures: ``before`` and ``expected``, those of blocks of ground with the
     margins of the other blocks (None with too few cells): coverage, median and mean width in metres; ``lowest``, the
-    smallest coverage of a block; ``warnings``, lines for the user.
+    smallest coverage of a block; ``warnings``, lines.
+
+    Raises
+    ------
+    SatIntervalsError
+        A file cannot be used, or too few cells have an interval and a reference height.
     """
     given = open_comparison(surface, reference)
     tags = read_tags(given.surface)

@@ -44,15 +44,32 @@ class _Ranges:
 def evaluate_surface(
     surface: str | Path, reference: str | Path, classes: str | Path | None = None, *, registers: bool = True
 ) -> dict[str, Any]:
-    """Evaluate the heights and intervals of a surface model against heights above the same datum, in any CRS.
+    """Evaluate the heights and intervals of a surface model against reference heights.
 
-    With ``registers`` the reference is first moved by its constant shift from the surface. If it is n times finer than
-    the cells, each cell is compared with n x n heights; else with the one nearest to its centre, or interpolated there
-    if the reference was moved. ``classes`` is a raster of whole numbers, such as land cover.
+    Parameters
+    ----------
+    surface
+        File of `make_surface`.
+    reference
+        Raster of heights in metres above the same datum, in any CRS. If it is n times finer than the cells, each cell
+        is compared with n x n heights; else with the one nearest to its centre, or interpolated there if the reference
+        was moved.
+    classes
+        Raster of whole numbers, such as land cover, in any CRS.
+    registers
+        Whether the reference is first moved by its constant shift from the surface.
 
-    Returns figures of `Accuracy.report` for ``all`` heights, ``before`` registration, by ``slope`` of the reference
-    (degrees), ``half_width`` of the interval (metres) and ``classes``; ``registration``, see `Registration.report`;
-    ``nominal``, the level of the intervals, and what it is (``nominal_is``): ``coverage``, ``alpha``, or None.
+    Returns
+    -------
+    Figures of `Accuracy.report` (metres, shares) for ``all`` heights, ``before`` registration, by ``slope`` of the
+    reference (degrees), ``half_width`` of the interval (metres) and ``classes``; ``registration``, see
+    `Registration.report`; ``nominal``, the level of the intervals, and what it is (``nominal_is``): ``coverage``,
+    ``alpha``, or None; ``warnings``, lines.
+
+    Raises
+    ------
+    SatIntervalsError
+        A file cannot be read, has no heights in common with the other, or another datum or unit.
     """
     given = open_comparison(surface, reference)
     tags = read_tags(given.surface)

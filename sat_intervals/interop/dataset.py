@@ -1,4 +1,4 @@
-"""Open a finished run as a lazy xarray dataset. Importing this module registers the accessor ``intervals``."""
+"""Open a run or surface model as a lazy xarray dataset. Importing this module registers the accessor ``intervals``."""
 
 from collections.abc import Hashable, Sequence
 from pathlib import Path
@@ -11,19 +11,29 @@ from xarray.core import indexing
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import FLAGS, INVALID, WIDTH, flag_attributes
-from sat_intervals.raster import grid_mapping, read_layers, run_files
-from sat_intervals.results import Run, open_run
+from sat_intervals.raster import (
+    File,
+    Georeferencing,
+    grid_mapping,
+    is_surface,
+    read_layers,
+    read_place,
+    read_tags,
+    run_files,
+    surface_file,
+)
+from sat_intervals.results import open_run
 from sat_intervals.tiling import Window
 
 _PLACE = "spatial_ref"  # the name that rioxarray and odc-geo look for
 
 
 class _Layer(BackendArray):
-    """One band of a file of a run, read when it is indexed."""
+    """One band of a file, read when it is indexed."""
 
-    def __init__(self, run: Run, name: str, band: int, dtype: str) -> None:
-        self.file, self.band = run.out / name, band
-        self.shape, self.dtype = run.shape, np.dtype(dtype)
+    def __init__(self, file: Path, shape: tuple[int, int], band: int, dtype: str) -> None:
+        self.file, self.band = file, band
+        self.shape, self.dtype = shape, np.dtype(dtype)
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
         return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.BASIC, self._read)
@@ -64,32 +74,73 @@ def open(out: str | Path, chunks: int | None = 2048) -> xr.Dataset:
         The folder is not a finished run, or a file cannot be read.
     """
     run = open_run(out)
-    dataset = xr.Dataset(coords=_coordinates(run))
+    dataset = xr.Dataset(coords=_coordinates(run.georeferencing, run.shape))
     dataset.attrs = {"title": "disparity with intervals", "source": "sat-intervals", "finished": run.report["finished"]}
     if run.config.preset:
         dataset.attrs["preset"] = run.config.preset
     for file in run_files(run.config.products.compression, run.config.extra_bands):
-        for number, band in enumerate(file.bands, start=1):
-            lazy = indexing.LazilyIndexedArray(_Layer(run, file.name, number, file.dtype))
-            attributes = {"long_name": band.meaning} | ({"units": band.unit} if band.unit else {})
-            dataset[band.name] = xr.Variable(("y", "x"), lazy, attributes)
+        _add_bands(dataset, file, run.out / file.name, run.shape)
     dataset["validity"].attrs = flag_attributes()
     if chunks is not None:
         dataset = dataset.chunk({"y": chunks, "x": chunks})
     dataset["width"] = dataset.intervals.width()
-    for variable in dataset.data_vars.values():
-        variable.encoding["grid_mapping"] = _PLACE
+    dataset["width"].encoding["grid_mapping"] = _PLACE
     return dataset
 
 
-def _coordinates(run: Run) -> dict[Hashable, Any]:
+def open_surface(path: str | Path, chunks: int | None = 2048) -> xr.Dataset:
+    """Open a surface model as a lazy dataset: ``sat_intervals.open_surface("out/dsm.tif")``.
+
+    Parameters
+    ----------
+    path
+        File that `surface` or `make_surface` has written.
+    chunks
+        Rows and columns of a dask chunk, as for `open`.
+
+    Returns
+    -------
+    Dataset
+        With the dimensions ``y`` and ``x``: ``height``, ``height_lower``, ``height_upper`` (metres), ``count``,
+        ``confidence`` and ``agreement``, NaN where unknown. The coordinate ``spatial_ref`` has CRS and transform by the
+        CF conventions. Attributes are ``vertical_datum``, what heights are above, the ``coverage`` or ``alpha`` of the
+        intervals.
+
+    Raises
+    ------
+    SatIntervalsError
+        The file cannot be read, or is no surface model of this package.
+    """
+    file = Path(path)
+    shape, place = read_place(file)
+    if not is_surface(file):
+        raise SatIntervalsError(f"{file} has not the bands of a surface model: give a dsm.tif of this package")
+    tags = read_tags(file)
+    dataset = xr.Dataset(coords=_coordinates(place, shape))
+    dataset.attrs = {"title": "surface model with intervals", "source": "sat-intervals"}
+    dataset.attrs["vertical_datum"] = datum = tags["HEIGHTS"].removeprefix("above ")
+    dataset.attrs |= {name: float(tags[name.upper()]) for name in ("coverage", "alpha") if name.upper() in tags}
+    _add_bands(dataset, surface_file(file.name), file, shape)
+    level = "reference_ellipsoid" if datum.endswith("ellipsoid") else "geopotential_datum"
+    dataset["height"].attrs["standard_name"] = f"height_above_{level}"
+    return dataset if chunks is None else dataset.chunk({"y": chunks, "x": chunks})
+
+
+def _add_bands(dataset: xr.Dataset, file: File, path: Path, shape: tuple[int, int]) -> None:
+    """Add the bands of a file as lazy variables."""
+    for number, band in enumerate(file.bands, start=1):
+        lazy = indexing.LazilyIndexedArray(_Layer(path, shape, number, file.dtype))
+        attributes = {"long_name": band.meaning} | ({"units": band.unit} if band.unit else {})
+        dataset[band.name] = xr.Variable(("y", "x"), lazy, attributes, {"grid_mapping": _PLACE})
+
+
+def _coordinates(place: Georeferencing, shape: tuple[int, int]) -> dict[Hashable, Any]:
     """Return the centres of pixels, where they are a grid along the axes of the CRS, and the grid mapping."""
-    place = run.georeferencing
     coordinates: dict[Hashable, Any] = {_PLACE: ((), 0, grid_mapping(place))}
     if place.transform is not None and not place.transform.b and not place.transform.d:
         units = {"units": "m"} if place.crs is not None and place.crs.is_projected else {}
         starts, steps = (place.transform.f, place.transform.c), (place.transform.e, place.transform.a)
-        for name, start, step, count in zip("yx", starts, steps, run.shape, strict=True):
+        for name, start, step, count in zip("yx", starts, steps, shape, strict=True):
             coordinates[name] = (name, start + step * (np.arange(count) + 0.5), {"axis": name.upper()} | units)
     return coordinates
 

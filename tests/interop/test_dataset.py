@@ -1,4 +1,4 @@
-"""Finished runs as lazy datasets."""
+"""Finished runs and surface models as lazy datasets."""
 
 import dask.array
 import numpy as np
@@ -6,6 +6,8 @@ import pytest
 import xarray as xr
 from finished import PLACE, random_bands, write_run
 from numpy.testing import assert_allclose, assert_array_equal
+from surfaces import PLACE as SURFACE_PLACE
+from surfaces import write_surface
 
 import sat_intervals
 from sat_intervals import SatIntervalsError, decode_flags, evaluate_run
@@ -53,6 +55,23 @@ def test_open__has_a_place_that_rioxarray_and_odc_geo_recognise(made, tmp_path):
     box = dataset["lower"].odc.geobox
     assert (box.shape, box.crs.epsg, tuple(box.transform)[:6]) == ((70, 90), 32631, tuple(PLACE.transform)[:6])
     assert tuple(dataset.isel(y=slice(10, 20))["lower"].rio.transform())[5] == PLACE.transform.f - 5
+
+
+def test_open_surface__has_the_heights_their_place_and_their_datum(made, tmp_path):
+    height = np.arange(12.0).reshape(3, 4)
+    tags = {"HEIGHTS": "above egm96.gtx", "COVERAGE": "0.9"}
+    file = write_surface(tmp_path / "dsm.tif", height, height - 1, height + np.nan, tags)
+    surface = sat_intervals.open_surface(file, chunks=2)
+    assert surface["height"].chunksizes == {"y": (2, 1), "x": (2, 2)}
+    assert_array_equal(surface["height"], height)
+    assert_array_equal(surface["height_lower"], height - 1)
+    assert np.isnan(surface["height_upper"]).all()
+    assert (surface.vertical_datum, surface.coverage) == ("egm96.gtx", 0.9)
+    assert surface["height"].attrs["standard_name"] == "height_above_geopotential_datum"
+    assert (float(surface["x"][0]), float(surface["y"][0])) == (SURFACE_PLACE.c + 0.5, SURFACE_PLACE.f - 0.5)
+    assert "UTM zone 31N" in surface["spatial_ref"].attrs["crs_wkt"]
+    with pytest.raises(SatIntervalsError, match="has not the bands of a surface model"):
+        sat_intervals.open_surface(made[1] / "intervals.tif")
 
 
 def test_decode_flags__has_each_flag_and_what_is_valid(made):
