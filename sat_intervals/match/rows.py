@@ -149,7 +149,6 @@ def fit_rows(looks: Sequence[Look], rows: int, columns: int) -> RowFit | None:
     not fitted to; a constant where none holds. None with fewer than three looks.
     """
     matching = [look for look in looks if look.share >= _MATCHED]
-    matching = matching if len(matching) >= _FEWEST else []  # one or two may match by chance
     share, looks = len(matching) / max(1, len(looks)), matching or looks
     if len(looks) < _FEWEST:
         return None

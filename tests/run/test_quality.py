@@ -86,8 +86,7 @@ def test_doubts_of_images__of_two_sizes(scene, tmp_path):
     assert line.startswith(f"{left}: 17 % of the pixels are exactly 777, along its borders")
     given = [open_image(image, nodata=value) for image, value in ((left, 777), (right, None))]
     assert doubts_of_images(*given) == []
-    (line,) = doubts_of_images(open_image(left, nodata=778), open_image(right))
-    assert line == f"{left}: no pixel that was read is 778, the no-data value given: check it"
+    assert doubts_of_images(open_image(left, nodata=778), open_image(right)) == []  # some rows do not tell
 
 
 def test_warnings_of__isolated_pixels_without_data(scene, tmp_path):
