@@ -21,7 +21,7 @@ FILES = {
 
 
 # Of MC-CNN only.
-OF_NETWORK = {f"{COSTS}/1_1": "tiles", f"{ONCE}/statistics": "tiles"}
+OF_NETWORK = {f"{COSTS}/1_1": "tiles"}
 
 
 def made(folder, **more):
