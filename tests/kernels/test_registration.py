@@ -95,8 +95,9 @@ def test_register__deviations_hold(heights_at):
     kinds = [(noise, wide, cells, wide == 1) for noise in (0.1, 0.7) for wide in (1, 3) for cells in (0.25, 3.7)]
     errors, deviations = errors_and_deviations(heights_at, kinds)
     assert (np.abs(errors) <= 1.645 * deviations).mean() >= 0.75
-    assert np.abs(errors.mean(axis=0)).max() < 0.1
-    assert np.sqrt((errors**2).mean()) == pytest.approx(np.sqrt((deviations**2).mean()), rel=0.5)
+    size = np.sqrt((deviations**2).mean())
+    assert np.abs(errors.mean(axis=0)).max() < 3 * size / np.sqrt(len(kinds))
+    assert np.sqrt((errors**2).mean()) == pytest.approx(size, rel=0.5)
 
 
 @pytest.mark.parametrize("aligned", [True, False])

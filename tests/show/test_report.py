@@ -171,7 +171,6 @@ def test_page__tells_what_the_run_tells(page):
         ("#search", "5.0 % of its pixels are 0"),
         ("#warnings", "left.tif: 5 % of the pixels are exactly 0"),
         ("#tiles", "6 tiles of 27 x 27 pixels"),
-        ("#tiles", "5.0 % of the disparities, 10.0 % of the bounds of 100 pixels"),
         ("#evaluation", "high confidence"),
         ("#run", "keep_rejected"),
         ("#run", "tiles, read (sum over workers)"),
