@@ -48,18 +48,20 @@ def surface(
     finished with these images and settings is kept, the surface is made again.
     """
     from sat_intervals.cli.console import Console
+    from sat_intervals.run.beside import compiled_beside
     from sat_intervals.workflows.surface import FILES, surface
 
     if len(sensor_files) > 1:
         raise click.UsageError("give --left-model, --right-model, --left-grid and --right-grid once.")
     left, right = pair.open()
     settings.check_kept(out, *(out / name for name in FILES))
-    with Console(run.quiet or as_json) as console:
+    config = settings.load()
+    with Console(run.quiet or as_json) as console, compiled_beside(config):
         done = surface(
             left,
             right,
             out,
-            settings.load(),
+            config,
             **cells,
             **raw,
             sensors=sensor_files[0] if sensor_files else (),

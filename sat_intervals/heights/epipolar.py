@@ -96,12 +96,12 @@ def epipolar_geometry(
     left: SensorImage, right: SensorImage, terrain: Terrain, resolution_of: str, ground: tuple[float, int] | None = None
 ) -> Epipolar:
     """Return the grids of the overlap of a raw pair on the ground, see `ground_of`; raise without overlap or base."""
-    likely = likely_height(left, right)
-    height, reach = (terrain.altitude, 0) if terrain.altitude is not None else ground or (likely, 0)
+    height, reach = ground or (likely_height(left, right) if terrain.altitude is None else terrain.altitude, 0)
     for one in (left, right):
         one.check_height(height)
     share, parts = _overlap(left, right, height, reach, f"at {height:.0f} m above the ellipsoid")
     if terrain.altitude is not None:
+        likely = likely_height(left, right)
         larger = float(common_parts(left, right, likely, _BEYOND)[0][0])
         if share < _MUCH * larger:
             _LOG.warning(

@@ -37,12 +37,13 @@ def read_with_ground(
     grounds, shares = zip(*(ground_of(*pair) for pair in pairs), strict=True)
     fits = np.array(shares) >= _AS_GOOD * max(shares)
     chosen = int(fits.argmax())
-    for one, readings in zip(pairs[chosen], (lefts, rights), strict=True):
-        if len(readings) > 1 and fits.sum() > 1:
+    for side, one in enumerate(pairs[chosen]):
+        origins = dict.fromkeys(pair[side].origin for pair, is_fit in zip(pairs, fits, strict=True) if is_fit)
+        if others := [origin for origin in origins if origin != one.origin]:
             _LOG.warning(
-                "%s: its RPC tags are taken for its own pixels; if they are for an image where it begins at row %g, "
-                "column %g, give that image as its model",
-                *(one.image.path, *readings[-1].origin),
+                "%s: its RPC tags are taken for an image where it begins at row %g, column %g; row %g, column %g fits "
+                "as well: if that is right, give the image that they are for as its model",
+                *(one.image.path, *one.origin, *others[0]),
             )
     return *pairs[chosen], grounds[chosen] if is_needed else None
 

@@ -29,9 +29,8 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any] |
     Parameters
     ----------
     left, right
-        ``(rows, columns)`` real numbers; the numbers of columns may differ. Rows correspond, or are made to, see
-        the setting ``rows``. NaN, infinity and
-        the masked pixels of a masked array are no data.
+        ``(rows, columns)`` real numbers; the numbers of columns may differ. Rows correspond, or are made to, see the
+        setting ``rows``. NaN, infinity and the masked pixels of a masked array are no data.
     config
         Settings, or a mapping as `load_config` takes it, by default those of satellite images; ``tiles`` has no effect.
         A search range that is auto is found first.

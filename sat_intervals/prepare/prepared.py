@@ -69,12 +69,13 @@ def prepare(
     """
     config, known = resolved(config), known or {}
     whole = Window(0, 0, *pair.shapes[0])
-    is_given = not config.disparity.is_auto
     config, search, ranges = _searched(pair, config, each, known)
     (left, right), widths = pair.names, [columns for _, columns in pair.shapes]
     config.disparity.check_images(left, widths[0], right, widths[1])
     survey = _surveyed(pair, config, each, region or whole, known) if looks or config.rows == "auto" else None
-    missed = survey.missed(lambda: found_range(pair, each)) if survey and is_given and region in (None, whole) else ""
+    missed = ""
+    if survey and not search and region in (None, whole):
+        missed = survey.missed(lambda: found_range(pair, each))
     try:
         rows = survey.taken(config.rows, missed) if survey else None
     except SatIntervalsError as error:

@@ -12,7 +12,6 @@ from sat_intervals.heights.geometry import geometry_warnings, set_geometry
 from sat_intervals.heights.rectified import IMAGES, rectified_files
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, check_not_replaced, files_of, open_image
-from sat_intervals.run.beside import compiled_beside
 from sat_intervals.run.pair import match_pair
 from sat_intervals.run.state import OUTPUTS
 from sat_intervals.tiling import Window
@@ -105,8 +104,7 @@ def surface(
     results = [out / name for name in (*OUTPUTS, *FILES)]
     check_not_replaced([*read, *pair.sensors, geoid, *grid], results, [out / "tiles"])
     check_sensors(pair.sensors, resolution, crs)
-    with compiled_beside(config):
-        run = match_pair(pair.left, pair.right, out, config, window=window, keep_tiles=keep_tiles, **how)
+    run = match_pair(pair.left, pair.right, out, config, window=window, keep_tiles=keep_tiles, **how)
     made = surface_of(out, pair.sensors, progress, **cells, choices=choices)
     doubts = pair.record["warnings"] if pair.record else []
     warnings = [*doubts, *run["warnings"], *geometry_warnings(made["geometry"])]

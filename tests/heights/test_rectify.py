@@ -436,7 +436,7 @@ def test_read_with_ground__says_how_tags_are_read_where_the_rows_do_not_tell(raw
     near = _rewritten(raw[0], tmp_path / "near.tif", (0, 2, 400, 500), transform=Affine.translation(2, 0))
     left, right = (SensorImage.readings(open_image(file), None) for file in (near, raw[1]))
     assert read_with_ground(left, right, is_needed=False)[0].origin == (0, 0)
-    assert "near.tif: its RPC tags are taken for its own pixels" in caplog.text
+    assert "near.tif: its RPC tags are taken for an image where it begins at row 0, column 0; row" in caplog.text
 
 
 def _as_written(kind, file, folder):
