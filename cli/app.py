@@ -41,7 +41,7 @@ RESUMED = ("match", "demo", "batch", "surface", "rectify")
 STEPS: dict[str, tuple[click.Command, ...]] = {
     "Try and prepare": (demo, search_range, plan, config),
     "Match": (match, batch, status),
-    "Look": (plot, report, project),
+    "BlockMatch": (plot, report, project),
     "Heights": (surface, rectify, dsm, triangulate),
     "Compare with a truth": (reference, evaluate, calibrate),
     "Use elsewhere": (export, stac),

@@ -26,7 +26,7 @@ from sat_intervals.cli.options import (
 if TYPE_CHECKING:
     from sat_intervals.config import Calibration
     from sat_intervals.config.pairs import Pair
-    from sat_intervals.run.measure import Subject
+    from sat_intervals.run.measure import CalibrationScene
 
 _CALIBRATION = """\
 # Calibration: levels of the cost curve, and factors, that reach a coverage, found by sat-intervals calibrate.
@@ -93,17 +93,17 @@ def calibrate(
         raise click.UsageError("give PAIRS, or --dsm and --reference.")
     from sat_intervals.cli.console import Console
     from sat_intervals.cli.tables import show_calibration
-    from sat_intervals.run.calibrate import calibration_from, check_subjects
-    from sat_intervals.run.measure import measure_subjects
+    from sat_intervals.run.calibrate import calibration_from, check_scenes
+    from sat_intervals.run.measure import measure_scenes
 
-    subjects = _subjects(pairs, truth, _Judging(settings, **judging))
-    _check_kept(settings, subjects, [*pairs, *truth], output)
+    scenes = _scenes(pairs, truth, _Judging(settings, **judging))
+    _check_kept(settings, scenes, [*pairs, *truth], output)
     check_output(output, overwrite=overwrite)
     folder = output.absolute().parent
-    check_subjects(subjects)
+    check_scenes(scenes)
     with Console(quiet or as_json) as console:
-        parts = measure_subjects(subjects, folder, console.progress)
-    calibration, expected = calibration_from(parts, subjects, name or output.stem)
+        parts = measure_scenes(scenes, folder, console.progress)
+    calibration, expected = calibration_from(parts, scenes, name or output.stem)
     write_calibration(output, calibration)
     if as_json:
         say_json({"calibration": calibration.model_dump(mode="json"), "expected": expected})
@@ -112,13 +112,15 @@ def calibrate(
         click.echo(str(output))
 
 
-def _check_kept(settings: SettingsArguments, subjects: "list[Subject]", given: Sequence[Path], output: Path) -> None:
+def _check_kept(
+    settings: SettingsArguments, scenes: "list[CalibrationScene]", given: Sequence[Path], output: Path
+) -> None:
     """Raise if the output is an input, describes one, or is a file that the settings name."""
     from sat_intervals.config import named_files, read_yaml
     from sat_intervals.raster.identity import check_not_replaced
 
     named = named_files(read_yaml(settings.file)) if settings.file else []
-    read = [file for one in subjects for file in (one.left.path, one.right.path, one.truth.image.path)]
+    read = [file for one in scenes for file in (one.left.path, one.right.path, one.truth.image.path)]
     described = [one / name for one in given for name in ("meta.json", "run.json")]
     check_not_replaced([*read, *given, *described, settings.file, *named], [output])
 
@@ -133,7 +135,7 @@ class _Judging:
     by_group: bool
 
 
-def _subjects(paths: tuple[Path, ...], truths: tuple[Path, ...], judging: _Judging) -> "list[Subject]":
+def _scenes(paths: tuple[Path, ...], truths: tuple[Path, ...], judging: _Judging) -> "list[CalibrationScene]":
     """Open the pairs and runs named by the arguments, in their order."""
     return [
         _of_pair(source.pair, source.truth, judging)
@@ -143,13 +145,13 @@ def _subjects(paths: tuple[Path, ...], truths: tuple[Path, ...], judging: _Judgi
     ]
 
 
-def _of_pair(pair: "Pair", truth: Path | None, judging: _Judging) -> "Subject":
+def _of_pair(pair: "Pair", truth: Path | None, judging: _Judging) -> "CalibrationScene":
     from sat_intervals.raster import open_image
-    from sat_intervals.run.measure import Subject, truth_of
+    from sat_intervals.run.measure import CalibrationScene, truth_of
 
     config = judging.settings.load(disparity={"minimum": pair.minimum, "maximum": pair.maximum})
     left = open_image(pair.left)
-    return Subject(
+    return CalibrationScene(
         pair.name,
         pair.group if judging.by_group else pair.name,
         left,
@@ -161,13 +163,13 @@ def _of_pair(pair: "Pair", truth: Path | None, judging: _Judging) -> "Subject":
     )
 
 
-def _of_run(out: Path, truth: Path | None, judging: _Judging) -> "Subject":
+def _of_run(out: Path, truth: Path | None, judging: _Judging) -> "CalibrationScene":
     """Open a finished run, with its own settings unless the options choose others."""
     from sat_intervals.config import Cluster, load_config
     from sat_intervals.config.pairs import group_beside
     from sat_intervals.errors import SatIntervalsError
     from sat_intervals.results import open_results
-    from sat_intervals.run.measure import Subject
+    from sat_intervals.run.measure import CalibrationScene
 
     run = open_results(out, truth)
     if run.truth is None:
@@ -179,7 +181,7 @@ def _of_run(out: Path, truth: Path | None, judging: _Judging) -> "Subject":
         here = run.config.model_copy(update={"cluster": Cluster()})  # the run's may be jobs of a batch system
         config = load_config(here, settings.sections)
     group = group_beside(run.left.path) if judging.by_group else str(out)
-    return Subject(
+    return CalibrationScene(
         str(out), group, run.left, run.right, run.truth, config, run.region, judging.tolerance, judging.remove_bias
     )
 

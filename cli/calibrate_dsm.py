@@ -30,7 +30,7 @@ def calibrate_heights(
     quiet: bool,
 ) -> None:
     """Calibrate the intervals of a surface model, and write and print their margins."""
-    from sat_intervals.evaluate.calibration import calibrate_surface
+    from sat_intervals.evaluate.surface_calibration import calibrate_surface
     from sat_intervals.raster.identity import check_not_replaced
 
     files = surface.dsm, surface.reference

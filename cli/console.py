@@ -17,7 +17,7 @@ STAGES = {
     "scene": "making a scene",
     "pairs": "checking pairs",
     "pairs.files": "writing files of pairs",
-    "subjects": "measuring pairs",
+    "scenes": "measuring pairs",
     "levels": "matching at levels",
     "kernels": "preparing kernels (compiled once per machine, then about a second)",
     "range": "finding the search range",

@@ -37,7 +37,7 @@ class Details:
         """Write figures and pictures of a surface model to a folder; return their paths."""
         from sat_intervals.cli.tables import surface_markdown
         from sat_intervals.evaluate.comparison import open_comparison
-        from sat_intervals.evaluate.dsm import read_profile
+        from sat_intervals.evaluate.surface_accuracy import read_profile
         from sat_intervals.raster.publishing import failing, write_file, write_record
         from sat_intervals.show.accuracy import draw_error_map, draw_height_profile, draw_reliability
 
@@ -76,7 +76,7 @@ details_options = gathered(
 def evaluate_heights(surface: Surface, details: Details, *, as_json: bool, quiet: bool) -> None:
     """Print figures, and write them with pictures to the folder, whose names are not printed if quiet."""
     from sat_intervals.cli.tables import show_surface
-    from sat_intervals.evaluate.dsm import evaluate_surface
+    from sat_intervals.evaluate.surface_accuracy import evaluate_surface
 
     if details.pictures:
         details.check_folder(details.pictures, surface)

@@ -69,8 +69,8 @@ def _verdicts(plan: "Plan", limit: int | None, kind: str) -> tuple[str, str]:
         return fits, fits
     tile = (plan.together_bytes - plan.worker_bytes) / (plan.together - 1)
     most = 1 + int((limit - plan.worker_bytes) / tile)
-    way_out = f"--workers {most}" if kind == "threads" else f"cluster.cores {most}"
-    return fits, f", does not fit in {memory}: give {way_out}"
+    remedy = f"--workers {most}" if kind == "threads" else f"cluster.cores {most}"
+    return fits, f", does not fit in {memory}: give {remedy}"
 
 
 def _duration(seconds: float) -> str:

@@ -53,10 +53,10 @@ def plot(
     from sat_intervals.errors import SatIntervalsError
     from sat_intervals.results import open_results
     from sat_intervals.show.coverage import check_one_pair, draw_coverage
-    from sat_intervals.show.dsm import draw_surface
     from sat_intervals.show.maps import draw_errors, draw_overview
+    from sat_intervals.show.preparation import draw_range, draw_rows, has_range, has_rows
     from sat_intervals.show.profile import draw_curve, draw_profile
-    from sat_intervals.show.search_range import draw_range, draw_rows, has_range, has_rows
+    from sat_intervals.show.surface_map import draw_surface
 
     results = open_results(out, truth)
     is_judged = results.truth is not None and results.config.interval is not None

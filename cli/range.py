@@ -31,7 +31,7 @@ def search_range(pair: PairArguments, output: Path | None, overwrite: bool, as_j
     from sat_intervals.prepare.local import write_ranges
     from sat_intervals.prepare.pair import FilePair
     from sat_intervals.prepare.prepared import prepare
-    from sat_intervals.prepare.search_range import collar_lines
+    from sat_intervals.prepare.search_range import undeclared_lines
     from sat_intervals.raster import files_of
     from sat_intervals.raster.identity import check_not_replaced
     from sat_intervals.raster.publishing import check_free
@@ -56,7 +56,7 @@ def search_range(pair: PairArguments, output: Path | None, overwrite: bool, as_j
         return
     for name, value in [*_rows(found), *_survey(survey)]:
         click.echo(f"{name:<36}{value}")
-    warn([*collar_lines(found.collars, pair.images), *rows_left(survey, "auto", pair.images[1])])
+    warn([*undeclared_lines(found.undeclared, pair.images), *rows_left(survey, "auto", pair.images[1])])
 
 
 def _rows(found: Any) -> list[tuple[str, str]]:
@@ -67,9 +67,9 @@ def _rows(found: Any) -> list[tuple[str, str]]:
         searched = f"{level.minimum} to {level.maximum} px searched, {100 * level.matched:.1f} % matched"
         rows.append((f"  images reduced by {level.step}", searched))
     rows += _histogram(found.histogram)
-    for side, collar in found.collars.items():
-        share = f"{100 * collar['share']:.0f} % of the pixels, along the borders"
-        rows.append((f"{side} image, value {collar['value']:g}", share))
+    for side, border in found.undeclared.items():
+        share = f"{100 * border['share']:.0f} % of the pixels, along the borders"
+        rows.append((f"{side} image, value {border['value']:g}", share))
     return rows
 
 

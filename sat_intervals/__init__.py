@@ -11,9 +11,9 @@ import typing
 if typing.TYPE_CHECKING:
     from sat_intervals.config import Config, load_config, load_height_calibration
     from sat_intervals.errors import RunError, SatIntervalsError
-    from sat_intervals.evaluate.calibration import calibrate_surface
     from sat_intervals.evaluate.disparity import evaluate_run
-    from sat_intervals.evaluate.dsm import evaluate_surface
+    from sat_intervals.evaluate.surface_accuracy import evaluate_surface
+    from sat_intervals.evaluate.surface_calibration import calibrate_surface
     from sat_intervals.heights.choices import SurfaceChoices
     from sat_intervals.heights.dsm import make_surface
     from sat_intervals.heights.geometry import set_geometry
@@ -66,11 +66,11 @@ _HOMES = {
     "SatIntervalsError": "errors",
     "SurfaceChoices": "heights.choices",
     "Window": "tiling",
-    "calibrate_surface": "evaluate.calibration",
+    "calibrate_surface": "evaluate.surface_calibration",
     "calibrate_volumes": "match.calibrate_volumes",
     "decode_flags": "interop.dataset",
     "evaluate_run": "evaluate.disparity",
-    "evaluate_surface": "evaluate.dsm",
+    "evaluate_surface": "evaluate.surface_accuracy",
     "intervals_around": "prepare.in_memory",
     "intervals_of": "match.volumes",
     "load_config": "config",

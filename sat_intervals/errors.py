@@ -22,8 +22,8 @@ class ChangedInputError(RunError):
     """An input that was replaced or changed during a run."""
 
 
-def check_file(path: str | os.PathLike[str], way_out: str) -> None:
+def check_file(path: str | os.PathLike[str], remedy: str) -> None:
     """Raise if a path is no file: it is missing, or a folder."""
     if not os.path.isfile(path):
         reason = "is a folder" if os.path.isdir(path) else "no such file"
-        raise SatIntervalsError(f"{os.fspath(path)}: {reason}: {way_out}")
+        raise SatIntervalsError(f"{os.fspath(path)}: {reason}: {remedy}")

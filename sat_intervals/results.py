@@ -12,7 +12,7 @@ import numpy as np
 from sat_intervals.config import Config, Regularization, load_config
 from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.kernels.confidence import low_confidence
-from sat_intervals.kernels.rows import RowOffsets
+from sat_intervals.kernels.row_offsets import RowOffsets
 from sat_intervals.products import BANDS, Bands
 from sat_intervals.raster import Georeferencing, Image, check_not_replaced, open_image, read_layers, read_tags
 from sat_intervals.raster.identity import absolute_in, identities

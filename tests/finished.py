@@ -70,7 +70,7 @@ def _report(inputs, bands, validity):
         "local_ranges": None,
         "survey": None,
         "rows": None,
-        "quality": {"noise": 0.41, "collars": {"left": {"value": 0.0, "share": 0.05}}},
+        "quality": {"noise": 0.41, "undeclared": {"left": {"value": 0.0, "share": 0.05}}},
         "warnings": ["left.tif: 5 % of the pixels are exactly 0"],
         "verdict": "80 % valid, but see the warning",
         "validity_bits": {

@@ -5,14 +5,14 @@ import numpy as np
 from sat_intervals import Config, Window
 from sat_intervals.kernels.matching import cost_volume
 from sat_intervals.match.costs import cost_of
-from sat_intervals.match.patch import Frame, kernel_settings, patch_areas
+from sat_intervals.match.patch import PatchFrame, kernel_settings, patch_areas
 from sat_intervals.match.whole import cut, whole_view
 from sat_intervals.products import IMPOSSIBLE_COST
 
 
 def volume_of(left: np.ndarray, right: np.ndarray, config: Config, *, sgm: bool = False) -> np.ndarray:
     """Our costs, aggregated or not: float32, NaN where impossible."""
-    cost, areas = cost_of(config), patch_areas(Frame.of_whole(Window(0, 0, *left.shape)), config)
+    cost, areas = cost_of(config), patch_areas(PatchFrame.of_whole(Window(0, 0, *left.shape)), config)
     windows = cost.windows(areas)
     (costs,) = cost.of_areas((cut(whole_view(left), windows[0]), cut(whole_view(right), windows[1])), areas)
     found = cost_volume(costs.costs, kernel_settings(config)._replace(regularized=sgm))

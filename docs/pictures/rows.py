@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 import rasterio
 from numpy import zeros
 
-from sat_intervals.kernels.rows import RowOffsets, shift_rows
+from sat_intervals.kernels.row_offsets import RowOffsets, shift_rows
 
 
 def main(file):

@@ -10,7 +10,7 @@ import numpy as np
 
 from sat_intervals.raster import read_layers, read_place
 from sat_intervals.show.canvas import GROUND, Frame, MapLayer, draw_layer, draw_map, map_size, page
-from sat_intervals.show.dsm import _relief
+from sat_intervals.show.surface_map import _relief
 
 CREDIT = "Pleiades imagery (c) CNES, distribution Airbus DS, published by CNES with Picanteo; Open Licence 2.0 (Etalab)"
 

@@ -16,7 +16,7 @@ from sat_intervals.config.sections import Exact, Odd, Section, absolute
 from sat_intervals.config.weights import NETWORKS, weights_file
 from sat_intervals.products import COSINE_STEPS
 
-# Integer costs of a foreign volume, at most: without SGM, and with it together with P2.
+# Integer costs of a external volume, at most: without SGM, and with it together with P2.
 _LEVELS, _SGM_LEVELS = 50_000, 8_190
 
 

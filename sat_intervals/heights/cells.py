@@ -84,7 +84,7 @@ def _equal_part(whole: int, most: int) -> int:
     return -(-whole // -(-whole // most))
 
 
-class Tally:
+class CellCounts:
     """Count the cells of a surface, and their widths."""
 
     def __init__(self) -> None:

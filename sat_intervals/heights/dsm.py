@@ -9,7 +9,7 @@ import numpy as np
 
 from sat_intervals.config import Calibration, Interval, surface_key
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.heights.cells import Tally, strips
+from sat_intervals.heights.cells import CellCounts, strips
 from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.geometry import FILE, Geometry, geometry_of
 from sat_intervals.heights.lattice import Ground, joined, on_map
@@ -98,7 +98,7 @@ def make_surface(
     tags["HEIGHTS"] = f"above {geoid or 'the WGS 84 ellipsoid'}"
     projection = _projection(geometries, crs, geoid)
     clouds = [PointCloud(one.run, on_map(one.lattice, projection, str(one.run.out)), choices) for one in geometries]
-    tally = Tally()
+    tally = CellCounts()
     with ThreadPoolExecutor(usable_cores()) as threads:
         cells = _cells(threads, clouds, resolution, radius, grid)
         place = north_up(projection.crs, cells.left, cells.top, cells.resolution)

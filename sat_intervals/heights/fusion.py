@@ -6,7 +6,7 @@ import numpy as np
 
 from sat_intervals.config import HeightCalibration
 from sat_intervals.kernels.conformal import widened
-from sat_intervals.kernels.splat import BOUNDED, CONFIDENCE, COUNT, HEIGHT, LOWER, UPPER, WEIGHT
+from sat_intervals.kernels.gridding import BOUNDED, CONFIDENCE, COUNT, HEIGHT, LOWER, UPPER, WEIGHT
 from sat_intervals.products import SURFACE
 
 # Metres: narrower intervals weigh as much as one of this width.

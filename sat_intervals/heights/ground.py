@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 
 from sat_intervals.heights.epipolar import MARGIN, STEP, shareloc_grids
 from sat_intervals.heights.models import SensorImage, common_heights, common_parts
-from sat_intervals.match.search_range import Step, match_level, reduced
+from sat_intervals.match.coarse import Step, match_level, reduced
 from sat_intervals.raster import BLOCK, read_window
 from sat_intervals.tiling import Window
 

@@ -15,7 +15,7 @@ import numpy as np
 from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.lattice import WINDOW, Extent, Ground, Lattice, joined
 from sat_intervals.kernels.disparity import median
-from sat_intervals.kernels.splat import BOUNDED, LOWER, UPPER, empty_cells, gather, mean_heights, medians, splat
+from sat_intervals.kernels.gridding import BOUNDED, LOWER, UPPER, empty_cells, gather, mean_heights, medians, splat
 from sat_intervals.products import OPEN_ABOVE, OPEN_BELOW, RANGE_INCOMPLETE, Bands
 from sat_intervals.results import Run
 from sat_intervals.tiling import Grid, Tile, Window
@@ -105,7 +105,7 @@ class PointCloud:
     def splat(
         self, cells: Cells, window: Window, radius: float, ended: threading.Event
     ) -> tuple[np.ndarray, Counter[str]]:
-        """Accumulate the points in a window of cells, see `kernels.splat`; ``radius`` in metres; ``ended`` stops it.
+        """Accumulate the points in a window of cells, see `kernels.gridding`; ``radius`` in metres; ``ended`` stops it.
 
         Also return the numbers of ``points`` that fall in these cells, and of those there that are left out as
         ``outliers``, because their interval is ``open``, or at the ``border`` of the right image without confidence.

@@ -16,7 +16,7 @@ _AROUND, _FURTHEST = 8, 8
 _STEEPEST, _CLEAR = np.tan(np.radians(60.0)), 1.0
 
 
-class PointSight:
+class PointVisibility:
     """The nearest of the points in each pixel of a region, kept in an empty file that is open for both ways.
 
     ``rise`` is the signed change of disparity for a height of one pixel's size on the ground.

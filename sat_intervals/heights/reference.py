@@ -16,8 +16,8 @@ from sat_intervals.heights.geometry import FILE, Geometry, geometry_of
 from sat_intervals.heights.lattice import Lattice, on_map
 from sat_intervals.heights.location import GroundLattice, Location
 from sat_intervals.heights.point_files import PointFile
-from sat_intervals.heights.point_sight import PointSight
-from sat_intervals.heights.raster_sight import RasterSight
+from sat_intervals.heights.point_sight import PointVisibility
+from sat_intervals.heights.raster_visibility import RasterVisibility
 from sat_intervals.heights.registering import blocks_of_points, blocks_of_raster
 from sat_intervals.heights.sensors import check_cover, lattice_of
 from sat_intervals.kernels.registration import LEAST, Registration, register
@@ -80,7 +80,7 @@ def make_truth(
         "SHIFT": " ".join(f"{part:.3f}" for part in shift) + " m",
     }
     tags |= tag_of_left(run.report["inputs"]["left"])
-    tally = _Tally(run)
+    tally = _PixelCounts(run)
     with (
         OutputWriter(path.parent, [truth_file(path.name)], *run.shape, run.georeferencing, tags) as writer,
         TemporaryFile(dir=path.parent) as file,
@@ -184,7 +184,7 @@ class _Work:
                 check_cover(self._sensors, self.run.region, right_width, minimum, maximum)
                 return lattice_of(self._sensors, self.run.region, minimum, maximum)
 
-            sight = RasterSight(self._lattice, wider, self._heights, self._projection, shift, self._search)
+            sight = RasterVisibility(self._lattice, wider, self._heights, self._projection, shift, self._search)
             strips = sight.strips(self._pixel)
         else:
             strips = self._points_seen(shift, file, progress).strips()
@@ -192,8 +192,8 @@ class _Work:
             progress("truth", row + len(strip), self.run.region.height)
             yield row, strip
 
-    def _points_seen(self, shift: np.ndarray, file: BinaryIO, progress: Progress) -> PointSight:
-        sight = PointSight(file, self.run.region, self._rise)
+    def _points_seen(self, shift: np.ndarray, file: BinaryIO, progress: Progress) -> PointVisibility:
+        sight = PointVisibility(file, self.run.region, self._rise)
         lattice = self._seen_from(shift, progress)
         if lattice is not None:
             for part in self._near(progress):
@@ -216,7 +216,7 @@ def _degrees(place: tuple[float, float]) -> str:
     return f"longitude {place[0]:.3f}, latitude {place[1]:.3f}"
 
 
-class _Tally:
+class _PixelCounts:
     """Compare true disparities with those of the run."""
 
     def __init__(self, run: Run) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.lattice import Extent, Lattice
 from sat_intervals.heights.point_cloud import Cells, PointCloud
+from sat_intervals.kernels.gridding import mean_heights
 from sat_intervals.kernels.registration import (
     ACROSS,
     POINTS,
@@ -18,7 +19,6 @@ from sat_intervals.kernels.registration import (
     spread_blocks,
 )
 from sat_intervals.kernels.relief import sampled
-from sat_intervals.kernels.splat import mean_heights
 from sat_intervals.raster import HeightRaster, Projection
 from sat_intervals.results import Run
 from sat_intervals.tiling import Window

@@ -14,7 +14,7 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.lattice import Lattice
 from sat_intervals.heights.models import read_model, read_with  # raises without the extra `dsm`
 from sat_intervals.kernels.compiled import kernels_of_others
-from sat_intervals.kernels.rows import RowOffsets
+from sat_intervals.kernels.row_offsets import RowOffsets
 from sat_intervals.progress import Progress
 from sat_intervals.raster import GROUND, Georeferencing, between_180
 from sat_intervals.tiling import Window
@@ -34,7 +34,7 @@ _CHECKED = 9
 # Degrees of longitude from the 180th meridian: models nearer to it are turned.
 _NEAR_180 = 2.0
 # Metres: lines of sight of one scene meet within centimetres, those of two scenes miss by hundreds of metres.
-_FOREIGN_RESIDUAL = 10.0
+_LARGEST_RESIDUAL = 10.0
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ def median_residual(sensors: Sensors, region: Window, minimum: int, maximum: int
             "which model and which grid belong to the left and the right image"
         )
     residual, height = float(np.median(points[:, 3])), float(np.median(points[:, 2]))
-    if not (residual <= _FOREIGN_RESIDUAL and GROUND[0] <= height <= GROUND[1]):
+    if not (residual <= _LARGEST_RESIDUAL and GROUND[0] <= height <= GROUND[1]):
         raise SatIntervalsError(
             f"the models do not fit these images: lines of sight miss each other by {residual:.1f} m at a height "
             f"of {height:.0f} m (medians): check which model and which grid belong to the left and the right image"

@@ -58,12 +58,12 @@ def triangulate(
     geometry = geometry_of(run, progress)
     run.check_kept([path], [run.out / FILE, *geometry.files])
     write = _write_las if path.suffix.lower() in (".laz", ".las") else _write_raster
-    tally = _Tally()
+    tally = _PointCounts()
     write(run, geometry.lattice, path, tally, progress)
     return tally.report() | geometry.report
 
 
-def _write_raster(run: Run, lattice: Lattice, path: Path, tally: "_Tally", progress: Progress) -> None:
+def _write_raster(run: Run, lattice: Lattice, path: Path, tally: "_PointCounts", progress: Progress) -> None:
     with OutputWriter(path.parent, [points_file(path.name)], *run.shape, run.georeferencing, {}) as writer:
         for window, bands in _strips(run):
             layers = _layers(lattice, window, np.where(bands.valid, bands[:3], np.float32(np.nan)))
@@ -75,7 +75,7 @@ def _write_raster(run: Run, lattice: Lattice, path: Path, tally: "_Tally", progr
         progress("files", 1, 1)
 
 
-def _write_las(run: Run, lattice: Lattice, path: Path, tally: "_Tally", progress: Progress) -> None:
+def _write_las(run: Run, lattice: Lattice, path: Path, tally: "_PointCounts", progress: Progress) -> None:
     try:
         import laspy
     except ModuleNotFoundError as error:
@@ -117,7 +117,7 @@ def _disk_errors() -> Iterator[None]:
         raise OSError(str(error)) from error
 
 
-class _Tally:
+class _PointCounts:
     """Count points, and keep the lowest and the highest."""
 
     def __init__(self) -> None:

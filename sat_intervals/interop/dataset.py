@@ -28,7 +28,7 @@ from sat_intervals.tiling import Window
 _PLACE = "spatial_ref"  # the name that rioxarray and odc-geo look for
 
 
-class _Layer(BackendArray):
+class _LazyBand(BackendArray):
     """One band of a file, read when it is indexed."""
 
     def __init__(self, file: Path, shape: tuple[int, int], band: int, dtype: str) -> None:
@@ -129,7 +129,7 @@ def open_surface(path: str | Path, chunks: int | None = 2048) -> xr.Dataset:
 def _add_bands(dataset: xr.Dataset, file: File, path: Path, shape: tuple[int, int]) -> None:
     """Add the bands of a file as lazy variables."""
     for number, band in enumerate(file.bands, start=1):
-        lazy = indexing.LazilyIndexedArray(_Layer(path, shape, number, file.dtype))
+        lazy = indexing.LazilyIndexedArray(_LazyBand(path, shape, number, file.dtype))
         attributes = {"long_name": band.meaning} | ({"units": band.unit} if band.unit else {})
         dataset[band.name] = xr.Variable(("y", "x"), lazy, attributes, {"grid_mapping": _PLACE})
 

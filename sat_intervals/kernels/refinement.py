@@ -8,7 +8,7 @@ line by line of their windows, so that the loops over columns vectorise.
 import numpy as np
 
 from sat_intervals.kernels.compiled import cached, inlined, part
-from sat_intervals.kernels.rows import cubic_weights
+from sat_intervals.kernels.row_offsets import cubic_weights
 
 # Columns that the right image needs on either side of those that the search range faces.
 MARGIN = 4

@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from sat_intervals.kernels.compiled import cached, inlined
-from sat_intervals.kernels.rows import AFTER, BEFORE, cubic_weights
+from sat_intervals.kernels.row_offsets import AFTER, BEFORE, cubic_weights
 
 ONE, TWO, THREE = np.uint64(1), np.uint64(2), np.uint64(3)
 

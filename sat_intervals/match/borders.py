@@ -15,7 +15,7 @@ from sat_intervals.kernels.matching import trace
 from sat_intervals.kernels.sgm import WALL, WAVEFRONTS, Borders, Edge
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.matching_cost import AreaCosts
-from sat_intervals.match.patch import Frame, frame_area, mirrored_settings, patch_settings, path_window
+from sat_intervals.match.patch import PatchFrame, frame_area, mirrored_settings, patch_settings, path_window
 from sat_intervals.tiling import Tile, Window
 
 Place = tuple[int, int]
@@ -77,7 +77,7 @@ def rehulled(edge: Edge, minimum: int, config: Config) -> Edge:
     return Edge(*found)
 
 
-def borders_of(frame: Frame, config: Config, found: Sequence[Mapping[Place, Border]]) -> Borders:
+def borders_of(frame: PatchFrame, config: Config, found: Sequence[Mapping[Place, Border]]) -> Borders:
     """Borders of a tile for the kernels, from those of its neighbours by wavefront and place."""
     patch, size = frame_area(frame, config).base, padded_to_lanes(config.disparity.count)
     around = tuple(_around(wavefront, patch, borders, size) for wavefront, borders in enumerate(found))
@@ -86,7 +86,7 @@ def borders_of(frame: Frame, config: Config, found: Sequence[Mapping[Place, Bord
 
 def trace_area(
     cost: AreaCosts,
-    frame: Frame,
+    frame: PatchFrame,
     borders: Borders,
     wavefront: int,
     config: Config,

@@ -7,10 +7,10 @@ import numpy as np
 import xarray as xr
 
 from sat_intervals.config import Calibration, Config, ConfigError, key_of
-from sat_intervals.match.calibration import calibration_of_parts
-from sat_intervals.match.foreign import open_foreign
+from sat_intervals.match.external import open_external
 from sat_intervals.match.gauge import Gauge, at_levels, block_numbers, pairs_of
-from sat_intervals.match.measurement import Measured, ladders
+from sat_intervals.match.levels import calibration_of_parts
+from sat_intervals.match.measurement import Measured, threshold_sweep
 from sat_intervals.match.volume import unmasked
 from sat_intervals.match.volumes import Kind, Values, costs_of, flags_of, matched_volume, volume_config
 from sat_intervals.match.whole import scale_of_rows
@@ -60,32 +60,32 @@ def calibrate_volumes(
     parts: list[Measured] = []
     described, pairs = [], list(pairs)
     for number, (volume, truth) in enumerate(pairs):
-        foreign = open_foreign(volume, disparities, kind, span)
-        settings = volume_config(foreign, config)
+        external = open_external(volume, disparities, kind, span)
+        settings = volume_config(external, config)
         if missing := [step for step in ("ambiguity", "regularization") if getattr(settings, step) is None]:
             raise ConfigError(f"{' and '.join(missing)} is null, but a calibration needs confidence: leave it on")
         true = unmasked(truth.data if isinstance(truth, xr.DataArray) else truth).astype(np.float64)
-        if true.shape != foreign.shape[:2]:
-            raise ConfigError(f"truth {number} is {true.shape}, its volume {foreign.shape[:2]}: give one a pixel")
-        rungs, flags = ladders(settings), flags_of(None, foreign.shape)
-        gauge = Gauge(rungs, f"volume {number}", tolerance / foreign.step, in_blocks=len(pairs) == 1)
+        if true.shape != external.shape[:2]:
+            raise ConfigError(f"truth {number} is {true.shape}, its volume {external.shape[:2]}: give one a pixel")
+        thresholds, flags = threshold_sweep(settings), flags_of(None, external.shape)
+        gauge = Gauge(thresholds, f"volume {number}", tolerance / external.step, in_blocks=len(pairs) == 1)
         blocks = block_numbers(0, len(true), true.shape) if len(pairs) == 1 else np.zeros(true.shape, np.int64)
         known = true[np.isfinite(true)]
-        among = np.mean((known >= foreign.disparities[0]) & (known <= foreign.disparities[-1])) if known.size else 1.0
+        among = np.mean((known >= external.disparities[0]) & (known <= external.disparities[-1])) if known.size else 1.0
         if among < _AMONG:
             raise ConfigError(
                 f"{100 * among:.0f} % of the disparities of truth {number} are among the candidates: check their sign, "
                 "x_right = x_left + disparity"
             )
-        true = (true - foreign.first) / foreign.step + settings.disparity.minimum
-        cost = costs_of(foreign, flags, settings)
-        for pair in pairs_of(rungs):
-            high, low = (float(rungs.low[rung]) for rung in pair)
-            rows, chosen = matched_volume(foreign, cost, flags, None, at_levels(settings, high, low, None))
+        true = (true - external.first) / external.step + settings.disparity.minimum
+        cost = costs_of(external, flags, settings)
+        for pair in pairs_of(thresholds):
+            high, low = (float(thresholds.low[threshold]) for threshold in pair)
+            rows, chosen = matched_volume(external, cost, flags, None, at_levels(settings, high, low, None))
             scale = scale_of_rows(rows, chosen)
             gauge.add(rows, slice(0, len(true)), scale, (true, blocks), pair, chosen)
         parts += gauge.measured()
-        ends = [float(foreign.disparities[0]), float(foreign.disparities[-1])]
+        ends = [float(external.disparities[0]), float(external.disparities[-1])]
         described.append({"name": f"volume {number}", "search_range": ends, "tolerance": tolerance})
     if (kept := sum(part.kept for part in parts)) < _FEWEST:
         raise ConfigError(f"{kept} kept pixels have a truth, at least {_FEWEST} are needed: give more pairs")

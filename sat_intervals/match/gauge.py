@@ -1,4 +1,4 @@
-"""Measure intervals at the rungs of a ladder, rows by rows, against a truth; see `measurement`."""
+"""Measure intervals at the thresholds of a sweep, rows by rows, against a truth; see `measurement`."""
 
 from collections.abc import Iterator
 from decimal import Decimal
@@ -8,7 +8,7 @@ import numpy as np
 
 from sat_intervals.config import Calibration, Config, Interval, key_of
 from sat_intervals.config.calibration import COVERAGES
-from sat_intervals.match.measurement import FIELDS, HIGH, QUANTILES, SCHEMES, Ladders, Measured, measure
+from sat_intervals.match.measurement import FIELDS, HIGH, QUANTILES, SCHEMES, Measured, ThresholdSweep, measure
 from sat_intervals.match.postprocess import (
     ConfidenceScale,
     Filtered,
@@ -20,15 +20,15 @@ from sat_intervals.match.postprocess import (
 from sat_intervals.match.refinement import bounds_of_both
 from sat_intervals.products import INVALID
 
-# In place of a rung of levels: the cut that factors are of.
+# In place of a threshold of levels: the cut that factors are of.
 OF_FITS = -1
 # A single pair is judged in blocks, this many along each side.
 _BLOCKS = 4
 
 
-def pairs_of(rungs: Ladders) -> list[tuple[int, int]]:
-    """Return the rungs of levels that are matched together; OF_FITS is the cut that factors are of."""
-    numbers = [*([] if rungs.are_one else [OF_FITS]), *range(rungs.low.size)]
+def pairs_of(thresholds: ThresholdSweep) -> list[tuple[int, int]]:
+    """Return the thresholds of levels that are matched together; OF_FITS is the cut that factors are of."""
+    numbers = [*([] if thresholds.are_one else [OF_FITS]), *range(thresholds.low.size)]
     return list(zip(numbers[::2], [*numbers[1::2], *numbers[-1:]], strict=False))
 
 
@@ -74,11 +74,11 @@ class _Piece(NamedTuple):
 class Gauge:
     """Measures the intervals of a pair, as a whole, of a group, or in blocks, that of `block_numbers`."""
 
-    def __init__(self, rungs: Ladders, group: str, tolerance: float, *, in_blocks: bool) -> None:
+    def __init__(self, thresholds: ThresholdSweep, group: str, tolerance: float, *, in_blocks: bool) -> None:
         parts = _BLOCKS**2 if in_blocks else 1
         self._names = [f"block {part}" for part in range(parts)] if in_blocks else [group]
-        self._rungs, self._tolerance = rungs, tolerance
-        self._tables = np.zeros((parts, rungs.low.size, SCHEMES, FIELDS))
+        self._rungs, self._tolerance = thresholds, tolerance
+        self._tables = np.zeros((parts, thresholds.low.size, SCHEMES, FIELDS))
 
     def measured(self) -> list[Measured]:
         """Return the measurement of each part."""
@@ -95,31 +95,33 @@ class Gauge:
         pair: tuple[int, int],
         config: Config,
     ) -> None:
-        """Measure the rows ``inner`` of some rows with their halo, whose cuts are a pair of rungs, see `pairs_of`.
+        """Measure the rows ``inner`` of some rows with their halo, whose cuts are a pair of thresholds, see `pairs_of`.
 
         ``truth``: of these rows, and the number of the part of each pixel.
         """
-        for rung, names in zip(dict.fromkeys(pair), (("lower", "upper"), ("lower_low", "upper_low")), strict=False):
+        for threshold, names in zip(
+            dict.fromkeys(pair), (("lower", "upper"), ("lower_low", "upper_low")), strict=False
+        ):
             lower, upper = (getattr(strip, name) for name in names)
             rows = filter_rows(
                 strip._replace(lower=lower, upper=upper, lower_low=lower, upper_low=upper), scale, config
             )
             piece = _Piece(rows, inner.start, inner.stop, *truth)
-            for number, scheme, bounds in self._bounds(piece, rung, config):
+            for number, scheme, bounds in self._bounds(piece, threshold, config):
                 self._tables[:, number, scheme] += self._measured(piece, scheme, bounds, config)
 
     def _bounds(
-        self, piece: _Piece, rung: int, config: Config
+        self, piece: _Piece, threshold: int, config: Config
     ) -> Iterator[tuple[int, int, tuple[np.ndarray, np.ndarray]]]:
-        """Yield the rungs and schemes that a piece is measured for, and their bounds."""
-        if rung == OF_FITS:
+        """Yield the thresholds and schemes that a piece is measured for, and their bounds."""
+        if threshold == OF_FITS:
             fits, lower, upper = piece.rows.fits(piece.inner), piece.of("lower"), piece.of("upper")
             for number, factor in enumerate(self._rungs.high):
                 yield number, HIGH, bounds_of_both(fits, lower, upper, factor, config)
             return
         for scheme, quantile in enumerate((None, *QUANTILES)):
             if scheme != HIGH or self._rungs.are_one:
-                yield rung, scheme, regularized(piece.rows, piece.first, piece.last, config, quantile)
+                yield threshold, scheme, regularized(piece.rows, piece.first, piece.last, config, quantile)
 
     def _measured(
         self, piece: _Piece, scheme: int, bounds: tuple[np.ndarray, np.ndarray], config: Config

@@ -1,10 +1,10 @@
-"""Measure intervals that were made at a ladder of levels against a truth (docs/coverage.md).
+"""Measure intervals that were made at a sweep of thresholds against a truth (docs/coverage.md).
 
-Every pair is matched at each rung of the levels, through the whole chain; factors are tried on one cut. Confidence
+Every pair is matched at each threshold of the levels, through the whole chain; factors are tried on one cut. Confidence
 classes are `HIGH` and low. Low-confidence pixels are measured once for each quantile of the regularisation, and once
 without it.
 
-Letters of shapes: rungs (levels of the ladder), schemes (high, then low with each of QUANTILES), fields.
+Letters of shapes: thresholds (levels of the sweep), schemes (high, then low with each of QUANTILES), fields.
 """
 
 from math import ceil
@@ -18,10 +18,10 @@ from sat_intervals.config import Config
 QUANTILES = (None, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 HIGH, SCHEMES = 0, 1 + len(QUANTILES)
 
-# Rungs: level 0, and from a fraction of the span to the level that holds every candidate, each 1.26 times the
+# Thresholds: level 0, and from a fraction of the span to the level that holds every candidate, each 1.26 times the
 # one before.
-_LOWEST, _RUNGS = 1 / 256, 25
-# Factors of the same number of rungs, and the last one.
+_LOWEST, _THRESHOLDS = 1 / 256, 25
+# Factors of the same number of thresholds, and the last one.
 _FACTORS, _ALL = (1 / 16, 64), 6e4
 # Widths are counted in steps of 1/64 px up to 8 px, and of 1 % above.
 _STEPS, _FINE, _RATIO = 64, 8, 1.01
@@ -41,7 +41,7 @@ class Measured(NamedTuple):
 
     group: parts of one group are left out together.
     weight: of a pixel: one over the pixels of the pair, so that every pair weighs the same.
-    table: ``(rungs, schemes, fields)`` float64 sums over kept pixels with truth.
+    table: ``(thresholds, schemes, fields)`` float64 sums over kept pixels with truth.
     """
 
     group: str
@@ -54,8 +54,8 @@ class Measured(NamedTuple):
         return int(self.table[0, [HIGH, HIGH + 1], COUNTS:].sum())
 
 
-class Ladders(NamedTuple):
-    """Rungs of both classes, ascending float64 ``(rungs,)``: the last ones hold every possible candidate.
+class ThresholdSweep(NamedTuple):
+    """Thresholds of both classes, ascending float64 ``(thresholds,)``: the last ones hold every possible candidate.
 
     low: levels at which pairs are matched.
     high: the same; with least squares factors of intervals, see `refinement.bounds_of_both`.
@@ -66,17 +66,17 @@ class Ladders(NamedTuple):
 
     @property
     def are_one(self) -> bool:
-        """Return whether a rung of one class has a meaning for the other."""
+        """Return whether a threshold of one class has a meaning for the other."""
         return self.high is self.low
 
 
-def ladders(config: Config) -> Ladders:
-    """Return the rungs that intervals of some settings are measured at."""
-    levels = np.concatenate([[0.0], np.geomspace(config.cost_span * _LOWEST, config.largest_sum, _RUNGS)])
+def threshold_sweep(config: Config) -> ThresholdSweep:
+    """Return the thresholds that intervals of some settings are measured at."""
+    levels = np.concatenate([[0.0], np.geomspace(config.cost_span * _LOWEST, config.largest_sum, _THRESHOLDS)])
     if not config.fits:
-        return Ladders(levels, levels)
-    factors = np.geomspace(_FACTORS[0], _FACTORS[1], _RUNGS - 1)
-    return Ladders(np.concatenate([[0.0], factors, [_ALL]]), levels)
+        return ThresholdSweep(levels, levels)
+    factors = np.geomspace(_FACTORS[0], _FACTORS[1], _THRESHOLDS - 1)
+    return ThresholdSweep(np.concatenate([[0.0], factors, [_ALL]]), levels)
 
 
 def measure(

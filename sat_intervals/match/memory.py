@@ -101,10 +101,10 @@ def check_strips(rows: int, width: int, config: Config, memory: int, strips_at_o
         )
 
 
-def check_memory(needed: int, what: str, way_out: str) -> None:
-    """Raise if ``needed`` bytes exceed the memory of this process; ``what`` and ``way_out`` are for the message."""
+def check_memory(needed: int, what: str, remedy: str) -> None:
+    """Raise if ``needed`` bytes exceed the memory of this process; ``what`` and ``remedy`` are for the message."""
     usable = usable_memory()
     if needed > usable:
         raise SatIntervalsError(
-            f"{what} need {needed / 1e9:.1f} GB, this process may use {usable / 1e9:.1f} GB: {way_out}"
+            f"{what} need {needed / 1e9:.1f} GB, this process may use {usable / 1e9:.1f} GB: {remedy}"
         )

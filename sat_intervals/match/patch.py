@@ -19,7 +19,7 @@ from sat_intervals.tiling import Window, facing
 _SHORT = 8
 
 
-class Frame(NamedTuple):
+class PatchFrame(NamedTuple):
     """A core and what surrounds it in its view.
 
     core: pixels whose products are kept.
@@ -35,7 +35,7 @@ class Frame(NamedTuple):
 
     @classmethod
     def of_whole(cls, whole: Window) -> Self:
-        """Frame of an image that is matched as one core."""
+        """PatchFrame of an image that is matched as one core."""
         return cls(whole, whole, whole)
 
 
@@ -95,23 +95,23 @@ def _of_whole_range(view: RightView, core: Window, settings: Settings) -> RightV
     return RightView(cost, winner)
 
 
-def frames_of(left: Frame, config: Config) -> list[Frame]:
+def frames_of(left: PatchFrame, config: Config) -> list[PatchFrame]:
     """Frames of the views that matching a core with exact seams needs: left and, for accurate cross-checking, right."""
     return [left, mirrored_frame(left, config)] if config.matches_right_view else [left]
 
 
-def mirrored_frame(frame: Frame, config: Config) -> Frame:
-    """Frame of the right view: the pixels that face a left core at the smallest disparity.
+def mirrored_frame(frame: PatchFrame, config: Config) -> PatchFrame:
+    """PatchFrame of the right view: the pixels that face a left core at the smallest disparity.
 
     The last core of a row also has the others that face it, so that each right pixel belongs to one core.
     """
     search, (core, region, whole, _) = config.disparity, frame
     last = search.minimum if core.column_stop < region.column_stop else search.maximum
     around, all_facing = (facing(there, search.minimum, search.maximum) for there in (region, whole))
-    return Frame(facing(core, search.minimum, last), around, all_facing, mirrored=True)
+    return PatchFrame(facing(core, search.minimum, last), around, all_facing, mirrored=True)
 
 
-def path_window(frame: Frame, config: Config) -> Window:
+def path_window(frame: PatchFrame, config: Config) -> Window:
     """Pixels whose paths a tile computes: its core and, at the ends of the region, the pixels that support it."""
     core, region, around = frame.core, frame.region, _supported(frame, config)
     row = around.row if core.row == region.row else core.row
@@ -121,17 +121,17 @@ def path_window(frame: Frame, config: Config) -> Window:
     return Window(row, column, row_stop - row, column_stop - column)
 
 
-def frame_area(frame: Frame, config: Config, ranges: LocalRanges | None = None) -> Area:
+def frame_area(frame: PatchFrame, config: Config, ranges: LocalRanges | None = None) -> Area:
     """Area that a tile reads: `path_window` and one more pixel on each side where another tile follows."""
     window = path_window(frame, config).grown(1, 1).clipped(_supported(frame, config))
     return Area.of(window, narrowed(ranges, window, config), frame.mirrored)
 
 
-def _supported(frame: Frame, config: Config) -> Window:
+def _supported(frame: PatchFrame, config: Config) -> Window:
     return frame.region.grown(config.tiles.support, config.tiles.support).clipped(frame.whole)
 
 
-def patch_areas(frame: Frame, config: Config, ranges: LocalRanges | None = None) -> list[Area]:
+def patch_areas(frame: PatchFrame, config: Config, ranges: LocalRanges | None = None) -> list[Area]:
     """Area of a core with what it reads around it and, for accurate cross-checking, that of the right view.
 
     The area may leave the region, but not the image.
@@ -146,7 +146,7 @@ def patch_areas(frame: Frame, config: Config, ranges: LocalRanges | None = None)
     return areas
 
 
-def _right_area(frame: Frame, overlap: int, config: Config) -> Area:
+def _right_area(frame: PatchFrame, overlap: int, config: Config) -> Area:
     """Area of the right pixels that face a core, with their overlap; they may be outside the right image."""
     search, whole = config.disparity, frame.whole
     reach = facing(frame.core, search.minimum, search.maximum)
@@ -155,7 +155,7 @@ def _right_area(frame: Frame, overlap: int, config: Config) -> Area:
 
 
 def match_patch(
-    frame: Frame,
+    frame: PatchFrame,
     costs: Sequence[AreaCosts],
     config: Config,
     borders: Sequence[Borders] | None = None,

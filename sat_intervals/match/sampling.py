@@ -1,4 +1,4 @@
-"""Look at blocks spread over a pair at full resolution: how noisy it is, and how far its rows differ.
+"""BlockMatch at blocks spread over a pair at full resolution: how noisy it is, and how far its rows differ.
 
 Letters: r row, c column.
 """
@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sat_intervals.kernels.cost import Codes, census
-from sat_intervals.kernels.rows import shift_equations
-from sat_intervals.match.search_range import Matches, Step, match_level, reduced, settings
+from sat_intervals.kernels.row_offsets import shift_equations
+from sat_intervals.match.coarse import Matches, Step, match_level, reduced, settings
 from sat_intervals.match.whole import cut, match_whole
 from sat_intervals.tiling import View, Window, facing
 
@@ -35,8 +35,8 @@ _BETWEEN, _RADIUS, _MATCHED = 4, 4, 0.5
 _LIKELY, _FARTHEST, _ENOUGH, _STEPS = 0.2, 1.5, 30, 3
 
 
-class Spot(NamedTuple):
-    """A block of the left image to look at, and the disparities to search there."""
+class SampleBlock(NamedTuple):
+    """A block of the left image to match, and the disparities to search there."""
 
     left: Window
     minimum: int
@@ -44,11 +44,11 @@ class Spot(NamedTuple):
 
     @property
     def views(self) -> tuple[Window, Window]:
-        """Return the windows of both images that `look` needs."""
+        """Return the windows of both images that `block_match` needs."""
         return self.left, facing(self.left, self.minimum, self.maximum).grown(_MOST * _STEP.rows, 0)
 
 
-class Look(NamedTuple):
+class BlockMatch(NamedTuple):
     """Figures of a block.
 
     row, column: middle of the part that was matched, row of the left and column of the right image.
@@ -66,11 +66,11 @@ class Look(NamedTuple):
     rows: float
 
 
-def spots(region: Window, minimum: int, maximum: int) -> list[Spot]:
+def sample_blocks(region: Window, minimum: int, maximum: int) -> list[SampleBlock]:
     """Return blocks spread over a region of the left image, to be searched over a range of disparities."""
     rows, columns = _starts(region.row, region.height), _starts(region.column, region.width)
     blocks = (Window(row, column, _SIDE, _SIDE).clipped(region) for row in rows for column in columns)
-    return [Spot(block, minimum, maximum) for block in blocks]
+    return [SampleBlock(block, minimum, maximum) for block in blocks]
 
 
 def _starts(first: int, size: int) -> list[int]:
@@ -79,19 +79,19 @@ def _starts(first: int, size: int) -> list[int]:
     return [first + max(0, size - _SIDE) * i // max(1, number - 1) for i in range(number)]
 
 
-def look(spot: Spot, left: View, right: View) -> Look | None:
+def block_match(sample: SampleBlock, left: View, right: View) -> BlockMatch | None:
     """Match a block coarsely, then a part of it at full resolution; None if too little is matched.
 
-    ``left`` and ``right`` are the views of the spot.
+    ``left`` and ``right`` are the views of the sample.
     """
     if (coarse := _coarse(left, right)) is None:
         return None
     matches, rows = coarse
-    part, first, last = _part(matches, spot.left)
+    part, first, last = _part(matches, sample.left)
     here = cut(left, part)
     for _ in range(3):
-        there = Window(part.row + rows, part.column + spot.minimum + first, part.height, part.width + last - first)
-        found = _fine(here, cut(right, there.grown(4, 4)), spot.minimum + first)
+        there = Window(part.row + rows, part.column + sample.minimum + first, part.height, part.width + last - first)
+        found = _fine(here, cut(right, there.grown(4, 4)), sample.minimum + first)
         if found is None:
             return None
         figures, shift = found
@@ -166,7 +166,7 @@ def _part(matches: Matches, block: Window) -> tuple[Window, int, int]:
     return part, int(low) - more, int(high) + more
 
 
-def _fine(left: View, right: View, minimum: int) -> tuple[Look, float] | None:
+def _fine(left: View, right: View, minimum: int) -> tuple[BlockMatch, float] | None:
     """Match a part and measure its rows; ``right`` is grown by 4 pixels. None if too little is matched.
 
     The place of the figures is the median disparity.
@@ -194,7 +194,7 @@ def _fine(left: View, right: View, minimum: int) -> tuple[Look, float] | None:
     column = np.arange(index.shape[1])
     random = _distances(*codes, (index + _AWAY + column) % codes[1].state.shape[1] - column, 0)[where].mean()
     middle = float(np.median(disparity[known])) + minimum
-    return Look(0.0, middle, int(known.sum()), float(known.mean()), float(matched), float(random), 0.0), shift
+    return BlockMatch(0.0, middle, int(known.sum()), float(known.mean()), float(matched), float(random), 0.0), shift
 
 
 def _shifts(equations: np.ndarray, pixels: np.ndarray) -> np.ndarray:
@@ -265,9 +265,9 @@ def _view(image: np.ndarray) -> View:
     return View(Window(0, 0, *image.shape), np.nan_to_num(image), np.isnan(image).view(np.uint8))
 
 
-def noise_of(looks: Iterable[Look]) -> float | None:
-    """Return the mean distance of matches over that of random candidates; None without looks."""
-    if not (told := list(looks)):
+def noise_of(samples: Iterable[BlockMatch]) -> float | None:
+    """Return the mean distance of matches over that of random candidates; None without samples."""
+    if not (told := list(samples)):
         return None
     weights = np.array([found.number for found in told], float)
     matched = np.average([found.matched for found in told], weights=weights)

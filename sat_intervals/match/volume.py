@@ -44,7 +44,7 @@ class VolumeCost(PairCost):
     ) -> list[AreaCosts]:
         """Make the integer costs of areas."""
         made = [self._made(views, area) for area in areas] if made is None else made
-        return [foreign_costs(costs, area.disparities, self._config) for area, costs in zip(areas, made, strict=True)]
+        return [external_costs(costs, area.disparities, self._config) for area, costs in zip(areas, made, strict=True)]
 
     def _made(self, views: Views, area: Area) -> np.ndarray:
         margin = self._config.cost.window // 2
@@ -118,7 +118,7 @@ def _check_sums(probabilities: np.ndarray, impossible: np.ndarray) -> None:
         )
 
 
-def foreign_costs(costs: np.ndarray, count: int, config: Config) -> AreaCosts:
+def external_costs(costs: np.ndarray, count: int, config: Config) -> AreaCosts:
     """Return what `integer_costs` makes of ``count`` candidates as costs for the kernels."""
     rows, columns = costs.shape[:2]
     possible = np.empty((rows, columns), np.int64)

@@ -9,13 +9,13 @@ import xarray as xr
 from sat_intervals.config import Config, ConfigError, load_config, resolved
 from sat_intervals.kernels.curves import read_right_winners
 from sat_intervals.kernels.disparity import cross_check
-from sat_intervals.match.foreign import Foreign, open_foreign
+from sat_intervals.match.external import ExternalVolume, open_external
 from sat_intervals.match.labelled import labelled
 from sat_intervals.match.matching_cost import AreaCosts
 from sat_intervals.match.memory import check_memory, volume_bytes
-from sat_intervals.match.patch import Frame, match_patch
+from sat_intervals.match.patch import PatchFrame, match_patch
 from sat_intervals.match.postprocess import RawRows
-from sat_intervals.match.volume import foreign_costs, integer_costs
+from sat_intervals.match.volume import external_costs, integer_costs
 from sat_intervals.match.whole import finish_whole
 from sat_intervals.products import IMPOSSIBLE_COST, INVALID, LEFT_MASKED, NO_DISPARITY, REJECTED, Bands
 from sat_intervals.tiling import Window, strips
@@ -76,57 +76,57 @@ def intervals_of(
     SatIntervalsError
         The volume cannot be used, or the settings do not fit it.
     """
-    foreign = open_foreign(volume, disparities, kind, span)
-    settings = volume_config(foreign, config)
+    external = open_external(volume, disparities, kind, span)
+    settings = volume_config(external, config)
     if settings.interval and settings.has_coverage and settings.interval.calibration is None:
         raise ConfigError(
             "interval.coverage needs a calibration of volumes of this matcher: make one with calibrate_volumes, or "
             "give interval.alpha"
         )
     settings = resolved(settings)
-    flags = flags_of(valid, foreign.shape)
-    rows, settings = matched_volume(foreign, costs_of(foreign, flags, settings), flags, right, settings)
-    return labelled(_in_pixels(finish_whole(rows, settings), foreign, settings), foreign.labels, {})
+    flags = flags_of(valid, external.shape)
+    rows, settings = matched_volume(external, costs_of(external, flags, settings), flags, right, settings)
+    return labelled(_in_pixels(finish_whole(rows, settings), external, settings), external.labels, {})
 
 
-def volume_config(foreign: Foreign, config: Config | Mapping[str, Any] | None) -> Config:
+def volume_config(external: ExternalVolume, config: Config | Mapping[str, Any] | None) -> Config:
     """Return settings for a volume."""
     given: Any = config if isinstance(config, Config) else {"preset": "paper", **(config or {})}
     sgm = {"sgm": given["sgm"]} if isinstance(config, Mapping) and "sgm" in config else {}
-    first = foreign.first_index
-    search = {"minimum": first, "maximum": first + foreign.shape[2] - 1, "local": False, "grid": None, "around": None}
-    found = load_config(given, {"cost": foreign.cost, "disparity": search, **sgm})  # not the penalties of another cost
+    first = external.first_index
+    search = {"minimum": first, "maximum": first + external.shape[2] - 1, "local": False, "grid": None, "around": None}
+    found = load_config(given, {"cost": external.cost, "disparity": search, **sgm})  # not the penalties of another cost
     if found.fits:
         found = load_config(found, {"refinement": {"method": "vfit"}, "products": {"sigma": False}})
     return found
 
 
-def costs_of(foreign: Foreign, flags: np.ndarray, config: Config) -> AreaCosts:
+def costs_of(external: ExternalVolume, flags: np.ndarray, config: Config) -> AreaCosts:
     """Return the costs of a volume; ``flags`` are those of pixels that are not matched, see `flags_of`."""
-    rows, columns, count = foreign.shape
+    rows, columns, count = external.shape
     check_memory(volume_bytes(rows, columns, config), f"{rows} x {columns} x {count} values", "give parts of it")
-    return foreign_costs(integer_costs(foreign.values, config, flags != 0), count, config)
+    return external_costs(integer_costs(external.values, config, flags != 0), count, config)
 
 
 def matched_volume(
-    foreign: Foreign, cost: AreaCosts, flags: np.ndarray, right: Values | None, config: Config
+    external: ExternalVolume, cost: AreaCosts, flags: np.ndarray, right: Values | None, config: Config
 ) -> tuple[RawRows, Config]:
     """Return the raw products of a volume, cross-checked already if the settings that come back have none."""
-    rows, columns, _ = foreign.shape
+    rows, columns, _ = external.shape
     checks = config.cross_check
-    is_plain = right is None and foreign.step == 1 and foreign.kind != "probability"
+    is_plain = right is None and external.step == 1 and external.kind != "probability"
     if checks and not is_plain:
         config = config.model_copy(update={"cross_check": None})
-    patch = match_patch(Frame.of_whole(Window(0, 0, rows, columns)), [cost], config)
+    patch = match_patch(PatchFrame.of_whole(Window(0, 0, rows, columns)), [cost], config)
     raw = patch.raw
     if not (raw.winner != NO_DISPARITY).any():
         raise ConfigError("the volume has no finite value at any valid pixel")
     np.copyto(raw.validity, flags, where=flags != 0)
     if checks and not is_plain:
         minimum, winners = (
-            _of_right(foreign, right, config) if right is not None else _of_diagonals(foreign, flags, config)
+            _of_right(external, right, config) if right is not None else _of_diagonals(external, flags, config)
         )
-        found = foreign.first + foreign.step * (raw.winner.astype(np.float64) - config.disparity.minimum)
+        found = external.first + external.step * (raw.winner.astype(np.float64) - config.disparity.minimum)
         last = minimum + winners.shape[1] - columns
         whole = np.clip(np.floor(found + 0.5), minimum, last).astype(np.int16)
         whole[raw.winner == NO_DISPARITY] = NO_DISPARITY
@@ -149,42 +149,42 @@ def flags_of(valid: Any, shape: tuple[int, ...]) -> np.ndarray:
     return (given & (INVALID & ~REJECTED)).astype(np.uint16)
 
 
-def _of_right(foreign: Foreign, right: Values, config: Config) -> tuple[int, np.ndarray]:
+def _of_right(external: ExternalVolume, right: Values, config: Config) -> tuple[int, np.ndarray]:
     """Return the winners of another volume, in the layout of `cross_check`, and the first disparity of that layout."""
     labelled_alone = isinstance(right, xr.Dataset | xr.DataArray)
-    there = open_foreign(
+    there = open_external(
         right,
-        None if labelled_alone else -foreign.disparities[::-1],
-        foreign.kind,
-        None if foreign.kind == "probability" else (foreign.lowest, foreign.highest),
+        None if labelled_alone else -external.disparities[::-1],
+        external.kind,
+        None if external.kind == "probability" else (external.lowest, external.highest),
     )
-    if there.shape[0] != foreign.shape[0]:
-        raise ConfigError(f"the right volume has {there.shape[0]} rows, the left one {foreign.shape[0]}")
+    if there.shape[0] != external.shape[0]:
+        raise ConfigError(f"the right volume has {there.shape[0]} rows, the left one {external.shape[0]}")
     settings = volume_config(there, config)
     cost = costs_of(there, np.zeros(there.shape[:2], np.uint16), settings)
-    raw = match_patch(Frame.of_whole(Window(0, 0, *there.shape[:2])), [cost], settings).raw
+    raw = match_patch(PatchFrame.of_whole(Window(0, 0, *there.shape[:2])), [cost], settings).raw
     back = np.floor(0.5 - (there.first + there.step * (raw.winner.astype(np.float64) - settings.disparity.minimum)))
     back[raw.winner == NO_DISPARITY] = NO_DISPARITY
-    first, last = int(np.floor(foreign.disparities[0])), int(np.ceil(foreign.disparities[-1]))
-    winners = np.full((foreign.shape[0], foreign.shape[1] + last - first), NO_DISPARITY, np.int16)
+    first, last = int(np.floor(external.disparities[0])), int(np.ceil(external.disparities[-1]))
+    winners = np.full((external.shape[0], external.shape[1] + last - first), NO_DISPARITY, np.int16)
     start = max(0, first)
     stop = max(start, min(there.shape[1], first + winners.shape[1]))
     winners[:, start - first : stop - first] = back[:, start:stop]
     return first, winners
 
 
-def _of_diagonals(foreign: Foreign, flags: np.ndarray, config: Config) -> tuple[int, np.ndarray]:
+def _of_diagonals(external: ExternalVolume, flags: np.ndarray, config: Config) -> tuple[int, np.ndarray]:
     """Return the same along the diagonals of the volume, among the candidates at whole pixels."""
-    every, start = foreign.whole_pixels
+    every, start = external.whole_pixels
     if every == 0 or config.sgm:
         raise ConfigError(
-            f"candidates {foreign.step:g} px apart{' with sgm' if config.sgm else ''} have no diagonals to cross-check "
-            "with: give right, or cross_check null"
+            f"candidates {external.step:g} px apart{' with sgm' if config.sgm else ''} have no diagonals to "
+            "cross-check with: give right, or cross_check null"
         )
-    minimum = round(foreign.first + start * foreign.step)
+    minimum = round(external.first + start * external.step)
     found = []
-    for window in strips(*foreign.shape[:2], _PIXELS):
-        values = foreign.values[window.row : window.row_stop, :, start::every]
+    for window in strips(*external.shape[:2], _PIXELS):
+        values = external.values[window.row : window.row_stop, :, start::every]
         blocked = flags[window.row : window.row_stop] != 0
         costs = integer_costs(values, config, blocked, compares_pixels=True)[:, :, : values.shape[2]]
         costs[costs == config.impossible_cost] = IMPOSSIBLE_COST
@@ -192,12 +192,12 @@ def _of_diagonals(foreign: Foreign, flags: np.ndarray, config: Config) -> tuple[
     return minimum, np.concatenate(found)
 
 
-def _in_pixels(bands: Bands, foreign: Foreign, config: Config) -> Bands:
+def _in_pixels(bands: Bands, external: ExternalVolume, config: Config) -> Bands:
     """Convert disparities in steps of the candidates to pixels."""
     first = config.disparity.minimum
-    if foreign.step == 1 and foreign.first == first:
+    if external.step == 1 and external.first == first:
         return bands
     disparity, lower, upper = (
-        ((band.astype(np.float64) - first) * foreign.step + foreign.first).astype(np.float32) for band in bands[:3]
+        ((band.astype(np.float64) - first) * external.step + external.first).astype(np.float32) for band in bands[:3]
     )
     return bands._replace(disparity=disparity, lower=lower, upper=upper)

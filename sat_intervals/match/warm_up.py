@@ -9,7 +9,7 @@ from sat_intervals.match.costs import cost_of
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.matching_cost import Given, VolumeOf
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
-from sat_intervals.match.patch import Frame, frame_area, match_patch, patch_areas
+from sat_intervals.match.patch import PatchFrame, frame_area, match_patch, patch_areas
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, postprocess_strips
 from sat_intervals.match.refinement import pixel_windows
 from sat_intervals.tiling import View, Window
@@ -22,7 +22,7 @@ def compile_kernels(config: Config, *, hands_states_on: bool = True) -> None:
     """
     random = np.random.default_rng(0)
     search = config.disparity
-    frame = Frame.of_whole(Window(0, 0, 4, 4))
+    frame = PatchFrame.of_whole(Window(0, 0, 4, 4))
     ends = np.array([search.minimum, search.maximum], np.int16).reshape(2, 1, 1)
     ranges = LocalRanges(ends[0], ends[1], 4, 4) if search.is_local else None
     statistics = PairStatistics(ImageStatistics(0.5, 0.3), ImageStatistics(0.5, 0.3))

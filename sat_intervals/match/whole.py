@@ -8,7 +8,7 @@ from sat_intervals.match.costs import cost_of
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.matching_cost import Given
 from sat_intervals.match.normalization import PairStatistics
-from sat_intervals.match.patch import Frame, Patch, match_patch, patch_areas
+from sat_intervals.match.patch import Patch, PatchFrame, match_patch, patch_areas
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_rows
 from sat_intervals.match.refinement import pixel_windows, pixels_of
 from sat_intervals.products import NO_DATA, NO_DISPARITY, Bands
@@ -27,7 +27,7 @@ def match_whole(
     ``statistics`` are those of the images; None if the matching cost needs none. ``ranges`` are local search ranges;
     None: all pixels search the whole range.
     """
-    frame = Frame.of_whole(Window(0, 0, *left.shape))
+    frame = PatchFrame.of_whole(Window(0, 0, *left.shape))
     cost, areas = cost_of(config, Given(statistics)), patch_areas(frame, config, ranges)
     windows = cost.windows(areas)
     whole = whole_view(left), whole_view(right)

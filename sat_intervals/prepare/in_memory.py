@@ -94,7 +94,7 @@ def _matched(left: Array, right: Array, config: Config, given: np.ndarray | None
     _check_shapes(*pixels, given)
     if not config.disparity.is_auto:
         _check_memory(pixels[0], config)
-    prepared = prepare(ArrayPair(_image(pixels[0]), _image(pixels[1]), given), config, looks=False)
+    prepared = prepare(ArrayPair(_image(pixels[0]), _image(pixels[1]), given), config, measures_rows=False)
     config, images = prepared.config, prepared.pair.images
     _check_memory(pixels[0], config)
     final = match_whole(*images, config, prepared.statistics, prepared.ranges)

@@ -8,7 +8,7 @@ import numpy as np
 
 from sat_intervals.config import Disparity
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.kernels.rows import RowOffsets, shift_rows
+from sat_intervals.kernels.row_offsets import RowOffsets, shift_rows
 from sat_intervals.match.around import CELL, ranges_around
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.whole import cut, whole_view

@@ -6,14 +6,14 @@ from typing import Any, Generic, TypeVar
 
 from sat_intervals.config import Config, resolved
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.kernels.rows import RowOffsets
+from sat_intervals.kernels.row_offsets import RowOffsets
 from sat_intervals.match.around import with_hull
+from sat_intervals.match.coarse import Found, with_range
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.normalization import Moments, PairStatistics, blocks, moments, statistics_of
-from sat_intervals.match.rows import Survey
-from sat_intervals.match.search_range import Found, with_range
+from sat_intervals.match.parallax import Survey
+from sat_intervals.prepare.block_matches import measured_parallax
 from sat_intervals.prepare.pair import Each, Pair, here
-from sat_intervals.prepare.parallax import measured_parallax
 from sat_intervals.prepare.search_range import found_range
 from sat_intervals.products import plain
 from sat_intervals.tiling import Window
@@ -60,19 +60,20 @@ def prepare(
     *,
     region: Window | None = None,
     known: Mapping[str, Any] | None = None,
-    looks: bool = True,
+    measures_rows: bool = True,
 ) -> Prepared[P]:
     """Find what the settings leave open.
 
     ``region`` of the left image is matched, by default all; search ranges and statistics are always those of the whole
-    images. ``known`` is from `Prepared.known` of the same images. ``looks``: whether rows are looked at without need.
+    images. ``known`` is from `Prepared.known` of the same images. ``measures_rows``: whether rows are measured
+    without need.
     """
     config, known = resolved(config), known or {}
     whole = Window(0, 0, *pair.shapes[0])
     config, search, ranges = _searched(pair, config, each, known)
     (left, right), widths = pair.names, [columns for _, columns in pair.shapes]
     config.disparity.check_images(left, widths[0], right, widths[1])
-    survey = _surveyed(pair, config, each, region or whole, known) if looks or config.rows == "auto" else None
+    survey = _surveyed(pair, config, each, region or whole, known) if measures_rows or config.rows == "auto" else None
     missed = ""
     if survey and not search and region in (None, whole):
         missed = survey.missed(lambda: found_range(pair, each))

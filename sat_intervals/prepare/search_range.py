@@ -6,23 +6,23 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.match.memory import check_memory
-from sat_intervals.match.normalization import BLOCK, blocks
-from sat_intervals.match.search_range import (
+from sat_intervals.match.coarse import (
     Found,
     NoRangeError,
     Step,
-    collar,
     find_range,
     finest_step,
     reduced,
     settings,
+    undeclared_border,
 )
+from sat_intervals.match.memory import check_memory
+from sat_intervals.match.normalization import BLOCK, blocks
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.prepare.pair import Each, Pair
 from sat_intervals.tiling import Grid, Window
 
-COLLAR = 0.01
+UNDECLARED = 0.01
 """Share of the pixels of an image that make an undeclared no-data border worth a warning."""
 _TASK = 500  # bytes of the window and the task of a block
 
@@ -34,24 +34,24 @@ def found_range(pair: Pair, each: Each) -> Found:
         check_memory(_TASK * number, f"{name}: {rows} x {columns} pixels in {number} blocks", "is it the right file?")
     compile_kernels(settings(0, 3))
     step = finest_step(pair.shapes[0][0], max(columns for _, columns in pair.shapes))
-    small, collars = [], dict[str, Any]()
+    small, undeclared = [], dict[str, Any]()
     for side, name in enumerate(("left", "right")):
         pixels, smallest = _reduced(pair, side, step, each)
-        found = collar(pixels, smallest)
-        if pair.is_plain(side) and found.mean() > COLLAR:
-            collars[name] = {"value": smallest, "share": round(float(found.mean()), 4)}
+        found = undeclared_border(pixels, smallest)
+        if pair.is_plain(side) and found.mean() > UNDECLARED:
+            undeclared[name] = {"value": smallest, "share": round(float(found.mean()), 4)}
             pixels[found] = np.nan
         small.append(pixels)
     try:
         found_range = find_range(small[0], small[1], step, pair.shapes[0])[0].fitted(pair.shapes[1][1])
     except NoRangeError as error:
-        hints = "".join(f"; {line}" for line in collar_lines(collars, pair.names))
+        hints = "".join(f"; {line}" for line in undeclared_lines(undeclared, pair.names))
         raise NoRangeError(
             f"{pair.names[0]} and {pair.names[1]}: {error}{hints}: give the search range with --disparity MIN MAX (in "
             "Python disparity minimum and maximum), or check that the images are an epipolar pair: raw ones go to "
             "sat-intervals surface, or to rectify first, with the --altitude of the ground"
         ) from None
-    return replace(found_range, collars=collars)
+    return replace(found_range, undeclared=undeclared)
 
 
 def reduce_block(pair: Pair, side: int, block: Window, step: Step) -> tuple[np.ndarray, float]:
@@ -74,11 +74,11 @@ def _reduced(pair: Pair, side: int, step: Step, each: Each) -> tuple[np.ndarray,
     return small, smallest
 
 
-def collar_lines(collars: Mapping[str, Any], names: tuple[str, str]) -> list[str]:
+def undeclared_lines(undeclared: Mapping[str, Any], names: tuple[str, str]) -> list[str]:
     """Return warnings of no data along the borders of images that nothing declares."""
     return [
-        f"{name}: {100 * collars[side]['share']:.0f} % of the pixels are exactly {collars[side]['value']:.9g}, along "
-        f"its borders, and no no-data value is declared: if it is no data, give --nodata {collars[side]['value']:.9g}"
+        f"{name}: {100 * border['share']:.0f} % of the pixels are exactly {border['value']:.9g}, along its borders, "
+        f"and no no-data value is declared: if it is no data, give --nodata {border['value']:.9g}"
         for side, name in zip(("left", "right"), names, strict=True)
-        if side in collars
+        if (border := undeclared.get(side))
     ]

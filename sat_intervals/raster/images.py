@@ -13,7 +13,7 @@ from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.io import DatasetReader
 
 from sat_intervals.errors import InputError
-from sat_intervals.kernels.rows import RowOffsets
+from sat_intervals.kernels.row_offsets import RowOffsets
 from sat_intervals.raster import gdal
 from sat_intervals.raster.files_of import files_of
 from sat_intervals.raster.georeferencing import Georeferencing, horizontal_name
@@ -102,8 +102,8 @@ def open_image(
     if pages > 1:
         _LOG.warning("%s has %d pages: the first is used; name another as GTIFF_DIR:2:%s", name, pages, name)
     if alphas and len(others) > 1:
-        way_out = f"if it is an image band, give gdal_edit.py -colorinterp_{alphas[0]} undefined"
-        _LOG.warning("%s: band %d is read as alpha, 0 is no data: %s", name, alphas[0], way_out)
+        remedy = f"if it is an image band, give gdal_edit.py -colorinterp_{alphas[0]} undefined"
+        _LOG.warning("%s: band %d is read as alpha, 0 is no data: %s", name, alphas[0], remedy)
     if "complex" in image.dtype:
         raise InputError(f"{name}: band {band} is {image.dtype}, matching needs real values: give its amplitude")
     if image.mask is not None:

@@ -17,7 +17,7 @@ from sat_intervals.products import as_json
 from sat_intervals.raster import gdal
 from sat_intervals.raster.files import File
 
-_WAY_OUT = "free disk space or choose another folder"
+_REMEDY = "free disk space or choose another folder"
 # Errors of the path: more space does not help.
 _OF_PATH = FileExistsError, FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError
 # Bytes of compressed pixels in those of the pixels, at most: noisy bands take a quarter, see `blocks`.
@@ -107,7 +107,7 @@ def failing(path: Path) -> Iterator[None]:
         if name is not None and Path(name) not in (path, _temporary(path), *path.parents):
             raise
         reason = getattr(error, "strerror", None) or gdal.reason(error)
-        what = f"{reason}: {'choose another name or folder' if isinstance(error, _OF_PATH) else _WAY_OUT}"
+        what = f"{reason}: {'choose another name or folder' if isinstance(error, _OF_PATH) else _REMEDY}"
         if gdal.is_out_of_memory(error):
             what = f"not enough memory ({gdal.reason(error)}): give the process more memory"
         raise OutputError(f"{path} cannot be written: {what}") from error
@@ -157,7 +157,7 @@ def check_space(folder: Path, needed: int, what: str) -> None:
     """Raise OutputError if a folder has not enough free space for ``what``, which may need so many bytes."""
     free = shutil.disk_usage(folder).free
     if needed > free:
-        raise OutputError(f"{folder} has {_size(free)} free, {what} may need {_size(needed)}: {_WAY_OUT}")
+        raise OutputError(f"{folder} has {_size(free)} free, {what} may need {_size(needed)}: {_REMEDY}")
 
 
 def _size(count: int) -> str:

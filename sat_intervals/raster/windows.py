@@ -10,7 +10,7 @@ from rasterio.enums import Resampling
 from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.errors import InputError
-from sat_intervals.kernels.rows import shift_rows
+from sat_intervals.kernels.row_offsets import shift_rows
 from sat_intervals.products import MASKED, NO_DATA
 from sat_intervals.raster.images import Image, opened
 from sat_intervals.tiling import View, Views, Window

@@ -119,8 +119,8 @@ class Job:
             ranges = self.prepared.ranges and self.prepared.ranges.report()
             self.store.write(ONCE, _RANGE, of=origin_of(self.inputs), ranges=ranges, **self.prepared.known())
         except OSError as error:
-            way_out = "make room, check its rights or choose another folder" if self.store.folder.is_local else _REMOTE
-            raise StoreError(f"{self.store.folder} cannot be used: {error.strerror or error}: {way_out}") from error
+            remedy = "make room, check its rights or choose another folder" if self.store.folder.is_local else _REMOTE
+            raise StoreError(f"{self.store.folder} cannot be used: {error.strerror or error}: {remedy}") from error
         self._check_space()
         return True
 

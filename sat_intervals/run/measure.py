@@ -1,4 +1,4 @@
-"""Match pairs with truth at a ladder of levels, tile by tile, and measure their intervals."""
+"""Match pairs with truth at a sweep of thresholds, tile by tile, and measure their intervals."""
 
 import shutil
 from collections.abc import Iterator, Sequence
@@ -15,7 +15,7 @@ from sat_intervals.config.sections import Refinement
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.match.gauge import OF_FITS, Gauge, at_levels, block_numbers, pairs_of
 from sat_intervals.match.histogram import bias_histogram
-from sat_intervals.match.measurement import QUANTILES, Ladders, Measured, ladders
+from sat_intervals.match.measurement import QUANTILES, Measured, ThresholdSweep, threshold_sweep
 from sat_intervals.match.postprocess import (
     ConfidenceScale,
     RawRows,
@@ -45,7 +45,7 @@ FEWEST = 1000  # pixels with truth, of all pairs
 
 
 @dataclass(frozen=True)
-class Subject:
+class CalibrationScene:
     """A pair with truth to calibrate with; those of one ``group`` are left out together.
 
     ``tolerance``: distance in pixels up to which a truth outside an interval counts as inside. ``remove_bias``: whether
@@ -74,27 +74,27 @@ def truth_of(left: Image, path: str | Path) -> Layer:
     return Layer(truth, 0, 0)
 
 
-def check_enough(pixels: int, subjects: Sequence[Subject], what: str) -> None:
+def check_enough(pixels: int, scenes: Sequence[CalibrationScene], what: str) -> None:
     """Raise if there are too few pixels with truth."""
     if pixels < FEWEST:
-        files = ", ".join(subject.truth.image.path for subject in subjects[:3])
+        files = ", ".join(scene.truth.image.path for scene in scenes[:3])
         raise SatIntervalsError(
             f"{files}: {pixels} {what}, at least {FEWEST} are needed: give more pairs, or check truth and masks"
         )
 
 
-def measure_subjects(subjects: Sequence[Subject], folder: Path, progress: Progress) -> list[Measured]:
-    """Match subjects at every level of the ladder, in ``folder``, and measure them."""
+def measure_scenes(scenes: Sequence[CalibrationScene], folder: Path, progress: Progress) -> list[Measured]:
+    """Match scenes at every level of the sweep, in ``folder``, and measure them."""
     found: list[Measured] = []
-    rungs = ladders(subjects[0].config)
-    compile_kernels(at_levels(subjects[0].config, 0.0, 0.0, QUANTILES[-1]))
-    with _scratch(folder) as scratch, Connection(subjects[0].config.cluster, scratch) as workers:
-        for number, subject in enumerate(subjects):
-            one = progress if len(subjects) == 1 else partial(_of_all, progress, "subjects", number, len(subjects))
-            one("subjects", 0, 1)
-            found += _of_subject(workers, subject, rungs, scratch / str(number), len(subjects) == 1, one)
-    progress("subjects", len(subjects), len(subjects))
-    check_enough(sum(part.kept for part in found), subjects, "kept pixels have a truth")
+    thresholds = threshold_sweep(scenes[0].config)
+    compile_kernels(at_levels(scenes[0].config, 0.0, 0.0, QUANTILES[-1]))
+    with _scratch(folder) as scratch, Connection(scenes[0].config.cluster, scratch) as workers:
+        for number, scene in enumerate(scenes):
+            one = progress if len(scenes) == 1 else partial(_of_all, progress, "scenes", number, len(scenes))
+            one("scenes", 0, 1)
+            found += _of_scene(workers, scene, thresholds, scratch / str(number), len(scenes) == 1, one)
+    progress("scenes", len(scenes), len(scenes))
+    check_enough(sum(part.kept for part in found), scenes, "kept pixels have a truth")
     return found
 
 
@@ -112,23 +112,28 @@ def _scratch(folder: Path) -> Iterator[Path]:
 
 
 def _of_all(progress: Progress, stage: str, number: int, total: int, *_: object) -> None:
-    """Report any progress of one of several subjects or batches of levels as theirs."""
+    """Report any progress of one of several scenes or batches of levels as theirs."""
     progress(stage, number, total)
 
 
-def _of_subject(
-    workers: Workers, subject: Subject, rungs: Ladders, folder: Path, in_blocks: bool, progress: Progress
+def _of_scene(
+    workers: Workers,
+    scene: CalibrationScene,
+    thresholds: ThresholdSweep,
+    folder: Path,
+    in_blocks: bool,
+    progress: Progress,
 ) -> list[Measured]:
-    """Match a subject, with two levels of the ladder at a time, and measure it."""
-    gauge: _SubjectGauge | None = None
+    """Match a scene, with two levels of the sweep at a time, and measure it."""
+    gauge: _SceneGauge | None = None
     with ExitStack() as stack:
-        pairs = pairs_of(rungs)
-        images = checked_pair(subject.left, subject.right, subject.config)
+        pairs = pairs_of(thresholds)
+        images = checked_pair(scene.left, scene.right, scene.config)
         each = EachOnWorkers(workers, progress)
-        without_cuts = at_levels(subject.config, 0.0, 0.0, None)  # and without local ranges
+        without_cuts = at_levels(scene.config, 0.0, 0.0, None)  # and without local ranges
         inputs = describe_inputs(*images, without_cuts, {})
-        prepared = prepare(FilePair(*images), without_cuts, each, region=subject.window)
-        jobs = [_begun(prepared, inputs, subject, rungs, pair, folder / str(pair[1]), stack) for pair in pairs]
+        prepared = prepare(FilePair(*images), without_cuts, each, region=scene.window)
+        jobs = [_begun(prepared, inputs, scene, thresholds, pair, folder / str(pair[1]), stack) for pair in pairs]
         # several tiles of one job keep all workers busy; stores of all jobs at once would fill the disk
         batches = [jobs] if len(jobs[0].store.grid) == 1 else [[job] for job in jobs]
         for number, batch in enumerate(batches):
@@ -138,10 +143,10 @@ def _of_subject(
             for matched in match_jobs(workers, batch, step):
                 job = matched.job
                 check_failures(job, matched.failures)
-                gauge = gauge or _SubjectGauge(job, subject, rungs, in_blocks)
+                gauge = gauge or _SceneGauge(job, scene, thresholds, in_blocks)
                 gauge.add(job, pairs[jobs.index(job)])
                 job.store.remove()
-        check_unchanged(jobs[0].inputs, subject.left, subject.right, jobs[0].config)
+        check_unchanged(jobs[0].inputs, scene.left, scene.right, jobs[0].config)
     assert gauge is not None  # there are jobs
     return gauge.gauge.measured()
 
@@ -149,19 +154,21 @@ def _of_subject(
 def _begun(
     prepared: Prepared[FilePair],
     inputs: dict[str, Any],
-    subject: Subject,
-    rungs: Ladders,
+    scene: CalibrationScene,
+    thresholds: ThresholdSweep,
     pair: tuple[int, int],
     out: Path,
     stack: ExitStack,
 ) -> Job:
-    """Make the job that matches a subject at two rungs; open its store."""
-    high, low = (subject.config.fit_cut if rung == OF_FITS else float(rungs.low[rung]) for rung in pair)
+    """Make the job that matches a scene at two thresholds; open its store."""
+    high, low = (
+        scene.config.fit_cut if threshold == OF_FITS else float(thresholds.low[threshold]) for threshold in pair
+    )
     config = prepared.config
     if config.fits:  # its tiles are those of V-fit, at any levels
         config = config.model_copy(update={"refinement": Refinement(method="vfit")})
     config = at_levels(config, high, low, None)
-    prepared, region = replace(prepared, config=config), checked_region(prepared.pair.left, subject.window)
+    prepared, region = replace(prepared, config=config), checked_region(prepared.pair.left, scene.window)
     job = job_of(prepared, out, inputs, {}, region, pair=out.parent.name)
     job = replace(job, has_files=False)
     job.begin()
@@ -169,15 +176,15 @@ def _begun(
     return job
 
 
-class _SubjectGauge:
-    """Measures the intervals of a subject, job by job."""
+class _SceneGauge:
+    """Measures the intervals of a scene, job by job."""
 
-    def __init__(self, job: Job, subject: Subject, rungs: Ladders, in_blocks: bool) -> None:
-        self._subject, self._in_blocks = subject, in_blocks
+    def __init__(self, job: Job, scene: CalibrationScene, thresholds: ThresholdSweep, in_blocks: bool) -> None:
+        self._scene, self._in_blocks = scene, in_blocks
         region = job.store.grid.region
         self._shape = region.height, region.width
-        self.gauge = Gauge(rungs, subject.group, subject.tolerance, in_blocks=in_blocks)
-        self._bias = self._found_bias(job) if subject.remove_bias else 0.0
+        self.gauge = Gauge(thresholds, scene.group, scene.tolerance, in_blocks=in_blocks)
+        self._bias = self._found_bias(job) if scene.remove_bias else 0.0
 
     def _found_bias(self, job: Job) -> float:
         histogram = bias_histogram()
@@ -189,10 +196,10 @@ class _SubjectGauge:
         return histogram.median() or 0.0
 
     def _truth(self, row: int, height: int) -> np.ndarray:
-        return self._subject.truth.read(Window(row, 0, height, self._shape[1]))
+        return self._scene.truth.read(Window(row, 0, height, self._shape[1]))
 
     def add(self, job: Job, pair: tuple[int, int]) -> None:
-        """Measure a job, whose cuts are a pair of rungs, see `pairs_of`."""
+        """Measure a job, whose cuts are a pair of thresholds, see `pairs_of`."""
         config = self._config(job)
         for row, strip, first, last, scale in _strips(job, config):
             truth, parts = self._truth(row, last - first) + self._bias, block_numbers(row, last - first, self._shape)
@@ -201,7 +208,7 @@ class _SubjectGauge:
             self.gauge.add(strip, slice(first, last), scale, (truth, parts), pair, config)
 
     def _config(self, job: Job) -> Config:
-        return job.config.model_copy(update={"refinement": self._subject.config.refinement})
+        return job.config.model_copy(update={"refinement": self._scene.config.refinement})
 
 
 def _strips(job: Job, config: Config) -> Iterator[tuple[int, RawRows, int, int, ConfidenceScale]]:

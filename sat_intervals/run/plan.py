@@ -98,7 +98,7 @@ def _searched(pair: FilePair, config: Config, progress: Progress) -> Config:
     if not (config.disparity.is_auto or config.disparity.is_local):
         return config
     with each_here(progress) as each:
-        found = prepare(pair, config.model_copy(update={"rows": "none"}), each, looks=False)
+        found = prepare(pair, config.model_copy(update={"rows": "none"}), each, measures_rows=False)
     return config.model_copy(update={"disparity": found.config.disparity})
 
 

@@ -8,10 +8,10 @@ import numpy as np
 
 from sat_intervals.config import Config, Disparity, calibration_of, unreached
 from sat_intervals.match.matching_cost import view_windows
+from sat_intervals.match.parallax import Survey
 from sat_intervals.match.patch import patch_areas
-from sat_intervals.match.rows import Survey
 from sat_intervals.prepare.pair import is_plain
-from sat_intervals.prepare.search_range import COLLAR, collar_lines
+from sat_intervals.prepare.search_range import UNDECLARED, undeclared_lines
 from sat_intervals.raster import Image, read_window
 from sat_intervals.run.job import Job
 from sat_intervals.run.source import frame_of
@@ -37,28 +37,30 @@ _ROW_OFFSET, _NOISE = 1.0, 0.55
 def quality_of(job: Job, tables: Tables) -> dict[str, Any]:
     """Return the quality of a pair.
 
-    ``noise``, see `noise_of`; ``collars``, see `Found`; ``no_data``, the share of pixels without data that tiles have
-    read of each side; ``same``, whether both images have the same pixels.
+    ``noise``, see `noise_of`; ``undeclared``, see `Found`; ``no_data``, the share of pixels without data that
+    tiles have read of each side; ``same``, whether both images have the same pixels.
     """
     looked = _look(job.left, job.right, job.store.grid.region) | {"no_data": _no_data(job, tables)}
-    looked["collars"] |= job.prepared.search.collars if job.prepared.search else {}
+    looked["undeclared"] |= job.prepared.search.undeclared if job.prepared.search else {}
     return looked | {"noise": job.prepared.survey and job.prepared.survey.noise}
 
 
 def _look(left: Image, right: Image, region: Window) -> dict[str, Any]:
-    """Return ``collars`` and ``same``, see `quality_of`, by some rows of both images."""
+    """Return ``undeclared`` and ``same``, see `quality_of`, by some rows of both images."""
     sides = {"left": left, "right": right}
     lines = {side: _lines(image, region, _ROWS) for side, image in sides.items() if is_plain(image)}
-    collars = {side: collar for side, of_side in lines.items() if (collar := _collar(*of_side))}
+    undeclared = {
+        side: undeclared_border for side, of_side in lines.items() if (undeclared_border := _undeclared(*of_side))
+    }
     (first, _), (second, state) = (_lines(image, region, 1) for image in sides.values())
     same = bool(first.size and (state == 0).any() and np.array_equal(first, second))
-    return {"collars": collars, "same": same}
+    return {"undeclared": undeclared, "same": same}
 
 
 def doubts_of_images(left: Image, right: Image, looked: Mapping[str, Any] | None = None) -> list[str]:
     """Return warnings of equal images, and of no data that is not declared or, of a run, that no pixel is."""
     looked = looked or _look(left, right, Window(0, 0, max(left.height, right.height), max(left.width, right.width)))
-    lines = collar_lines(looked["collars"], (left.path, right.path))
+    lines = undeclared_lines(looked["undeclared"], (left.path, right.path))
     if looked["same"]:
         lines.insert(0, f"{left.path} and {right.path} have the same pixels: give the left and the right image")
     given = [(side, image) for side, image in (("left", left), ("right", right)) if image.nodata_given]
@@ -92,7 +94,7 @@ def _lines(image: Image, region: Window, count: int) -> tuple[np.ndarray, np.nda
     return pixels, state
 
 
-def _collar(pixels: np.ndarray, state: np.ndarray) -> dict[str, float] | None:
+def _undeclared(pixels: np.ndarray, state: np.ndarray) -> dict[str, float] | None:
     """Return value and share of the pixels that begin or end rows and have their commonest value, None if few do."""
     values, counts = np.unique(pixels[:, [0, -1]][state[:, [0, -1]] == 0], return_counts=True)
     if not values.size:
@@ -100,8 +102,8 @@ def _collar(pixels: np.ndarray, state: np.ndarray) -> dict[str, float] | None:
     value = values[counts.argmax()]
     has = (pixels == value) & (state == 0)
     runs = np.logical_and.accumulate(has, 1) | np.logical_and.accumulate(has[:, ::-1], 1)[:, ::-1]
-    is_collar = runs.mean() > COLLAR
-    return {"value": float(value), "share": round(float(runs.mean()), 4)} if is_collar else None
+    is_undeclared = runs.mean() > UNDECLARED
+    return {"value": float(value), "share": round(float(runs.mean()), 4)} if is_undeclared else None
 
 
 def warnings_of(job: Job, counts: Mapping[str, Any], quality: Mapping[str, Any]) -> list[str]:

@@ -9,7 +9,7 @@ from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.match.costs import cost_of
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.matching_cost import AreaCosts, Given, MatchingCost
-from sat_intervals.match.patch import Frame, patch_areas
+from sat_intervals.match.patch import PatchFrame, patch_areas
 from sat_intervals.progress import timed
 from sat_intervals.raster import read_views
 from sat_intervals.raster.windows import kept_view, restored_view
@@ -27,9 +27,9 @@ class Source(NamedTuple):
     cost: MatchingCost
 
 
-def frame_of(job: Job, tile: Tile) -> Frame:
+def frame_of(job: Job, tile: Tile) -> PatchFrame:
     """Return a tile or block in its region and image."""
-    return Frame(tile.core, job.store.grid.region, Window(0, 0, job.left.height, job.left.width))
+    return PatchFrame(tile.core, job.store.grid.region, Window(0, 0, job.left.height, job.left.width))
 
 
 def read_source(job: Job, block: Tile, ranges: LocalRanges | None, seconds: dict[str, float]) -> Source:

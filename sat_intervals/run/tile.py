@@ -12,8 +12,8 @@ from sat_intervals.kernels.sgm import LAST, WAVEFRONTS, Borders, Edge
 from sat_intervals.match.borders import Border, Place, borders_of, in_order, rehulled, sources, trace_area
 from sat_intervals.match.local_ranges import LocalRanges, narrowed
 from sat_intervals.match.patch import (
-    Frame,
     Patch,
+    PatchFrame,
     frame_area,
     frames_of,
     match_patch,
@@ -117,7 +117,7 @@ def _place(tile: Tile) -> Place:
     return tile.grid_row, tile.grid_column
 
 
-def _frames(job: Job, tile: Tile) -> list[Frame]:
+def _frames(job: Job, tile: Tile) -> list[PatchFrame]:
     return frames_of(frame_of(job, tile), job.config)
 
 

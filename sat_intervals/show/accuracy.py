@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.evaluate.comparison import Comparison
-from sat_intervals.evaluate.dsm import Profile, error_map
+from sat_intervals.evaluate.surface_accuracy import Profile, error_map
 from sat_intervals.show.canvas import (
     DPI,
     GROUND,
     INK,
-    Frame,
     MapLayer,
+    PlotFrame,
     draw_layer,
     map_size,
     page,
@@ -66,7 +66,7 @@ def draw_error_map(given: Comparison, nmad: float, target: Path, dpi: int = DPI)
     unit, empty = "height - reference (m), red: too high", "no common height"
     layer = MapLayer("", unit, errors, "RdBu_r", (-end, end), if_empty=empty)
     with page(target, (width + 1.8, height + 0.8), dpi, name) as figure:
-        draw_layer(figure.subplots(), Frame(*extent, GROUND), layer)
+        draw_layer(figure.subplots(), PlotFrame(*extent, GROUND), layer)
 
 
 def draw_height_profile(profile: Profile, target: Path, names: Sequence[str], dpi: int = DPI) -> None:

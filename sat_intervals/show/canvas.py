@@ -32,7 +32,7 @@ _BARS, _LEAST_SHARE = 48, 0.001  # of a histogram of widths: most bars, least sh
 _STYLE: Any = {"font.family": "DejaVu Sans", "font.size": 10, "axes.titlesize": 11, "axes.titlelocation": "left"}
 
 
-class Frame(NamedTuple):
+class PlotFrame(NamedTuple):
     """Coordinates of a map at its left, right, bottom and top edge, and the names of its axes."""
 
     left: float
@@ -42,7 +42,7 @@ class Frame(NamedTuple):
     names: tuple[str, str] = ("column", "row")
 
     @classmethod
-    def of(cls, shape: tuple[int, int]) -> "Frame":
+    def of(cls, shape: tuple[int, int]) -> "PlotFrame":
         """Return the frame of rows and columns."""
         return cls(-0.5, shape[1] - 0.5, shape[0] - 0.5, -0.5)
 
@@ -83,7 +83,7 @@ def fitting(shape: tuple[int, int], inches: tuple[float, float], dpi: int) -> tu
     return rows, columns
 
 
-def draw_map(panel: Axes, frame: Frame, values: np.ndarray, title: str, **options: Any) -> AxesImage:
+def draw_map(panel: Axes, frame: PlotFrame, values: np.ndarray, title: str, **options: Any) -> AxesImage:
     """Draw values as a map with its axes; ``options`` are those of matplotlib's imshow."""
     panel.set_facecolor(NOTHING)
     for axis in (panel.xaxis, panel.yaxis):
@@ -98,7 +98,7 @@ def draw_map(panel: Axes, frame: Frame, values: np.ndarray, title: str, **option
     return panel.imshow(values, extent=frame[:4], aspect=aspect, interpolation="nearest", **options)
 
 
-def draw_layer(panel: Axes, frame: Frame, layer: MapLayer) -> Colorbar:
+def draw_layer(panel: Axes, frame: PlotFrame, layer: MapLayer) -> Colorbar:
     """Draw a layer as a map with a colour bar, whose ends are pointed where values are beyond them."""
     values, ends = layer.values, layer.ends
     drawn = draw_map(panel, frame, values, layer.title, cmap=layer.colours, norm=PowerNorm(layer.power, *ends))

@@ -12,8 +12,8 @@ from sat_intervals.results import Results
 from sat_intervals.show.canvas import (
     DPI,
     NOTHING,
-    Frame,
     MapLayer,
+    PlotFrame,
     add_histogram,
     draw_layer,
     draw_map,
@@ -47,7 +47,7 @@ def draw_overview(results: Results, target: Path, dpi: int = DPI) -> None:
         MapLayer("Confidence", "0 to 1", bands.confidence, "cividis", (0, 1)),
     )
     layers = [layer for layer in maps if np.isfinite(layer.values).any() or not valid.any()]
-    frame = Frame.of(results.shape)
+    frame = PlotFrame.of(results.shape)
     size = columns * (width + 1.0), rows * (height + 0.6) + 0.3
     ratio = results.region.height * results.region.width / (shape[0] * shape[1])
     thinned = [f"means of {ratio:,.{0 if ratio >= 10 else 1}f} pixels"] if shape != results.shape else []
@@ -96,7 +96,7 @@ def draw_errors(results: Results, target: Path, dpi: int = DPI) -> None:
     with page(target, (max(_TEXT, width + 0.9), height + 1.4), dpi, title) as figure:
         panel = figure.subplots()
         # Lower contrast than in the overview, so that the colours stand out.
-        frame = Frame.of(results.shape)
+        frame = PlotFrame.of(results.shape)
         _draw_grey(panel, frame, image, (low - 0.3 * (high - low), high + 0.3 * (high - low)))
         share = "No valid pixel has a known truth"
         if count:
@@ -114,12 +114,12 @@ def _arrangement(shape: tuple[int, int]) -> tuple[int, int]:
     return rows, 6 // rows
 
 
-def _draw_grey(panel: Axes, frame: Frame, image: np.ndarray, ends: tuple[float, float]) -> None:
+def _draw_grey(panel: Axes, frame: PlotFrame, image: np.ndarray, ends: tuple[float, float]) -> None:
     draw_map(panel, frame, image, "Left image", cmap="gray", vmin=ends[0], vmax=ends[1])
     say_empty(panel, image, "no data")
 
 
-def _draw_validity(panel: Axes, key: Axes, frame: Frame, validity: np.ndarray, counts: list[int]) -> None:
+def _draw_validity(panel: Axes, key: Axes, frame: PlotFrame, validity: np.ndarray, counts: list[int]) -> None:
     """Draw the class of each pixel, with a legend of their shares of all pixels."""
     colours = ListedColormap([kind.colour for kind in PIXEL_CLASSES])
     draw_map(panel, frame, classify(validity), "Validity", cmap=colours, vmin=-0.5, vmax=len(PIXEL_CLASSES) - 0.5)

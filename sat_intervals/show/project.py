@@ -47,7 +47,7 @@ class Raster:
 
 
 @dataclass(frozen=True)
-class Layer:
+class ProjectLayer:
     """A layer of the project: group, name and meaning in the list, its raster, and colours.
 
     ``is_default``: the raster alone gets this style, too; ``blend`` is QGIS' mode over the layers below.
@@ -87,7 +87,7 @@ def write_project(out: str | Path) -> list[Path]:
     return list(written)
 
 
-def _results(run: Run) -> Iterator[Layer]:
+def _results(run: Run) -> Iterator[ProjectLayer]:
     group, shape, place = "Disparity", run.shape, run.georeferencing
     intervals = Raster(run.out / "intervals.tif", place, shape)
     validity = Raster(run.out / "validity.tif", place, shape)
@@ -95,17 +95,17 @@ def _results(run: Run) -> Iterator[Layer]:
     counts = np.zeros(1 << 16, np.int64)
     for window in run.windows():
         counts += np.bincount(read_layers(validity.source, window).ravel(), minlength=counts.size)
-    yield Layer(group, "validity", "flags of every pixel", validity, styles.validity_classes(counts), True)
-    yield Layer(group, "confidence", BANDS[3].meaning, intervals, styles.shares(4))
+    yield ProjectLayer(group, "validity", "flags of every pixel", validity, styles.validity_classes(counts), True)
+    yield ProjectLayer(group, "confidence", BANDS[3].meaning, intervals, styles.shares(4))
     if run.config.interval:
         width = Raster(run.out / "width.vrt", place, shape, styles.difference(("intervals.tif", 3, 2), place, shape))
         wide = styles.widths(1, upper - lower, unit="px")
-        yield Layer(group, "interval width", "upper - lower bound, pixels", width, wide, True)
+        yield ProjectLayer(group, "interval width", "upper - lower bound, pixels", width, wide, True)
     ramp = styles.colours(1, disparity, styles.VIRIDIS, unit="px")
-    yield Layer(group, "disparity", BANDS[0].meaning, intervals, ramp, True, True)
+    yield ProjectLayer(group, "disparity", BANDS[0].meaning, intervals, ramp, True, True)
 
 
-def _surface(run: Run) -> Iterator[Layer]:
+def _surface(run: Run) -> Iterator[ProjectLayer]:
     if not run.has_current("dsm.tif"):
         return
     group, file = "Heights", run.out / "dsm.tif"
@@ -114,14 +114,14 @@ def _surface(run: Run) -> Iterator[Layer]:
     half = Raster(run.out / "dsm_half_width.vrt", place, shape, styles.difference((file.name, 3, 2), place, shape, 0.5))
     height, lower, upper, *_ = read_small_layers(file, _fitting(shape))
     wide = styles.widths(1, (upper - lower) / 2, unit="m")
-    yield Layer(group, "half width", "half the width of the height's interval, m", half, wide, True)
-    yield Layer(group, "confidence of heights", SURFACE[4].meaning, surface, styles.shares(5))
+    yield ProjectLayer(group, "half width", "half the width of the height's interval, m", half, wide, True)
+    yield ProjectLayer(group, "confidence of heights", SURFACE[4].meaning, surface, styles.shares(5))
     ramp = styles.colours(1, height, styles.VIRIDIS, unit="m")
-    yield Layer(group, "height", SURFACE[0].meaning, surface, ramp, True, True, _MULTIPLY)
-    yield Layer(group, "hillshade", "shaded heights", surface, styles.hillshade(1), is_shown=True)
+    yield ProjectLayer(group, "height", SURFACE[0].meaning, surface, ramp, True, True, _MULTIPLY)
+    yield ProjectLayer(group, "hillshade", "shaded heights", surface, styles.hillshade(1), is_shown=True)
 
 
-def _images(run: Run) -> Iterator[Layer]:
+def _images(run: Run) -> Iterator[ProjectLayer]:
     """Yield truth and images; those that cannot be opened are left out."""
     for name in ("truth", "left", "right") if run.truth_beside.exists() else ("left", "right"):
         try:
@@ -137,7 +137,7 @@ def _images(run: Run) -> Iterator[Layer]:
         if name == "truth":
             renderer = styles.colours(1, pixels, styles.VIRIDIS, unit="px")
         raster = Raster(image.path, image.georeferencing, shape)
-        yield Layer("Images", name, f"{name} image", raster, renderer, is_shown=name == "left")
+        yield ProjectLayer("Images", name, f"{name} image", raster, renderer, is_shown=name == "left")
 
 
 def _fitting(shape: tuple[int, int]) -> tuple[int, int]:
@@ -146,7 +146,7 @@ def _fitting(shape: tuple[int, int]) -> tuple[int, int]:
     return -(-shape[0] // step), -(-shape[1] // step)
 
 
-def _project(run: Run, layers: list[Layer]) -> Element:
+def _project(run: Run, layers: list[ProjectLayer]) -> Element:
     """Return the project; the first layer is on top, and its CRS and extent are those of the map."""
     root = Element("qgis", version=styles.VERSION, projectname=run.out.resolve().name)
     SubElement(root, "title").text = run.out.resolve().name
@@ -175,7 +175,7 @@ def _project(run: Run, layers: list[Layer]) -> Element:
     return root
 
 
-def _add_layer(listed: Element, layer: Layer, key: str, source: str) -> None:
+def _add_layer(listed: Element, layer: ProjectLayer, key: str, source: str) -> None:
     element = SubElement(listed, "maplayer", type="raster")
     styles.add_texts(element, id=key, datasource=source, layername=layer.name, provider="gdal", abstract=layer.meaning)
     _add_crs(SubElement(element, "srs"), layer.raster.place)

@@ -27,7 +27,7 @@ from sat_intervals.match.mccnn import MccnnCost
 from sat_intervals.match.measurement import Measured
 from sat_intervals.raster import open_image
 from sat_intervals.run.calibrate import calibration_from
-from sat_intervals.run.measure import Subject, measure_subjects, truth_of
+from sat_intervals.run.measure import CalibrationScene, measure_scenes, truth_of
 from sat_intervals.tiling import View
 
 DATA = Path(os.environ.get("SAT_INTERVALS_SHARED", "../shared")) / "data"
@@ -72,12 +72,12 @@ def tolerance_of(scene: str) -> float:
     return 1.0 if scene in WORLDVIEW else 0.0
 
 
-def subject_of(scene: str, preset: str) -> Subject:
+def scene_of(scene: str, preset: str) -> CalibrationScene:
     """Open a scene to calibrate with."""
     config = load_config(settings_of(preset) | {"disparity": search_of(scene)})
     left, right = (open_image(DATA / scene / f"{side}.tif") for side in ("left", "right"))
     truth, tolerance = truth_of(left, DATA / scene / "truth.tif"), tolerance_of(scene)
-    return Subject(scene, scene, left, right, truth, config, None, tolerance, tolerance > 0)
+    return CalibrationScene(scene, scene, left, right, truth, config, None, tolerance, tolerance > 0)
 
 
 def remembered(make: Callable[..., list[np.ndarray]]) -> Callable[..., list[np.ndarray]]:
@@ -101,10 +101,10 @@ MccnnCost._correlations = remembered(MccnnCost._correlations)
 
 
 @cache
-def measured(preset: str) -> tuple[list[Subject], list[Measured]]:
+def measured(preset: str) -> tuple[list[CalibrationScene], list[Measured]]:
     """Measure all scenes of a preset's calibration, or read what was measured before."""
-    subjects = [subject_of(scene, preset) for scene in scenes_of(preset)]
-    digest = hashlib.sha256(json.dumps(key_of(subjects[0].config)).encode())
+    scenes = [scene_of(scene, preset) for scene in scenes_of(preset)]
+    digest = hashlib.sha256(json.dumps(key_of(scenes[0].config)).encode())
     package = ROOT / "sat_intervals"
     inputs = [file.resolve() for scene in scenes_of(preset) for file in sorted((DATA / scene).iterdir())]
     for file in [*(file for names in SOURCES for file in sorted(package.glob(names))), *inputs]:
@@ -112,21 +112,21 @@ def measured(preset: str) -> tuple[list[Subject], list[Measured]]:
     kept = KEPT / f"{preset}-{digest.hexdigest()[:16]}.gz"
     if not kept.exists():
         with tempfile.TemporaryDirectory() as folder:
-            found = measure_subjects(subjects, Path(folder), lambda *_: None)
+            found = measure_scenes(scenes, Path(folder), lambda *_: None)
         KEPT.mkdir(parents=True, exist_ok=True)
         with gzip.open(kept.with_suffix(".new"), "wb", 3) as file:
             pickle.dump(found, file)
         kept.with_suffix(".new").replace(kept)
     with gzip.open(kept) as file:
-        return subjects, pickle.load(file)
+        return scenes, pickle.load(file)
 
 
 def main() -> None:
     """Make the calibrations of the presets that are named, by default of all."""
     OUT.mkdir(exist_ok=True)
     for preset in sys.argv[1:] or PRESETS:
-        subjects, parts = measured(preset)
-        calibration, expected = calibration_from(parts, subjects, preset)
+        scenes, parts = measured(preset)
+        calibration, expected = calibration_from(parts, scenes, preset)
         write_calibration(OUT / f"{preset}.yaml", calibration)
         show_calibration(calibration, expected)
 

@@ -59,9 +59,9 @@ def judged(scene: str, preset: str, interval: dict[str, Any], coverage: float) -
 @cache
 def without(scene: str, preset: str) -> Calibration:
     """Return the calibration of a preset that was made without a scene."""
-    pairs = [(subject, part) for subject, part in zip(*measured(preset), strict=True) if subject.name != scene]
-    subjects, parts = zip(*pairs, strict=True)
-    return calibration_from(parts, subjects, "others")[0]
+    pairs = [(scene, part) for scene, part in zip(*measured(preset), strict=True) if scene.name != scene]
+    scenes, parts = zip(*pairs, strict=True)
+    return calibration_from(parts, scenes, "others")[0]
 
 
 def intervals_of(scene: str, preset: str, coverages: Sequence[float] = COVERAGES) -> list[dict[str, float]]:

@@ -8,8 +8,8 @@ import numpy as np
 import rasterio
 
 from sat_intervals import match_arrays
+from sat_intervals.match.coarse import Found, find_range, finest_step, reduced
 from sat_intervals.match.local_ranges import LocalRanges
-from sat_intervals.match.search_range import Found, find_range, finest_step, reduced
 
 DATA = Path(os.environ.get("SAT_INTERVALS_SHARED", "../shared")) / "data"
 # Columns of the tables.

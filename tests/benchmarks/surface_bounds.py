@@ -19,7 +19,7 @@ from pyproj import Transformer
 from sat_intervals import demo, match_pair
 from sat_intervals.demo import PIXEL
 from sat_intervals.evaluate.accuracy import Heights
-from sat_intervals.evaluate.calibration import fitted, held_out
+from sat_intervals.evaluate.surface_calibration import fitted, held_out
 from sat_intervals.heights.choices import BOUNDS, SurfaceChoices
 from sat_intervals.heights.dsm import make_surface
 from sat_intervals.heights.geometry import set_geometry

@@ -12,7 +12,7 @@ from helpers import COMMAND
 from sat_intervals import SatIntervalsError, load_config, match_arrays, open_image
 from sat_intervals.cli import app
 from sat_intervals.config.pairs import read_batch
-from sat_intervals.evaluate.dsm import evaluate_surface
+from sat_intervals.evaluate.surface_accuracy import evaluate_surface
 from sat_intervals.products import SURFACE
 from sat_intervals.raster import Projection, read_window
 from sat_intervals.tiling import Window

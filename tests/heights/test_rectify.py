@@ -703,7 +703,7 @@ def test_surface__of_a_model_that_is_off_recovers_the_rows_or_ends_with_one_line
     result = invoke("surface", *near, tmp_path / "out", *SETTINGS)
     assert (result.exit_code, "lines of sight" in result.stderr) == (0, False)  # judged without the rows
     report = json.loads((tmp_path / "out" / "run.json").read_text())
-    rows = np.median([look[2] for look in report["survey"]["rows"]["looks"]])
+    rows = np.median([look[2] for look in report["survey"]["rows"]["samples"]])
     assert rows == pytest.approx((3 + 1e-4 * 300) * np.cos(TURNS[1]), abs=0.05)
     refusal = invoke("surface", *far, tmp_path / "far_out", *SETTINGS)
     assert refusal.exit_code == 2
@@ -752,34 +752,34 @@ def test_batch__makes_surfaces_of_raw_pairs(made, raw, tmp_path):
     assert contents(tmp_path / "out" / "raw") == before
 
 
-def _with_collar(folder, raw, collar, scale=1):
+def _with_undeclared_border(folder, raw, border, scale=1):
     """Write a raw pair whose empty corners have a value that nothing declares."""
-    paths = [folder / f"collar_{file.name}" for file in raw]
+    paths = [folder / f"bordered_{file.name}" for file in raw]
     for file, path in zip(raw, paths, strict=True):
         with rasterio.open(file) as dataset:
             pixels, profile, rpcs = dataset.read() * scale, dataset.profile, dataset.rpcs
-        pixels[pixels == 0] = collar
+        pixels[pixels == 0] = border
         with rasterio.open(path, "w", **profile | {"nodata": None, "dtype": pixels.dtype}, rpcs=rpcs) as dataset:
             dataset.write(pixels)
     return paths
 
 
-@pytest.mark.parametrize(("collar", "scale"), [(0, 1), (11, 1), (0, np.float32(1 / 4096))])
-def test_rectify__names_undeclared_no_data_of_the_raw_images(raw, tmp_path, collar, scale):
-    left, right = _with_collar(tmp_path, raw, collar, scale)
+@pytest.mark.parametrize(("border", "scale"), [(0, 1), (11, 1), (0, np.float32(1 / 4096))])
+def test_rectify__names_undeclared_no_data_of_the_raw_images(raw, tmp_path, border, scale):
+    left, right = _with_undeclared_border(tmp_path, raw, border, scale)
     result = invoke("rectify", left, right, tmp_path / "out", "--json")
     warned = json.loads(result.stdout)["warnings"]
     assert [f"warning: {line}" for line in warned] == [line for line in result.stderr.splitlines() if "exactly" in line]
     for path, line in zip((left, right), warned, strict=True):
-        assert re.fullmatch(rf"{path}: \d\d % of the pixels are exactly {collar}, .* give --nodata {collar}", line)
-    declared = invoke("rectify", left, right, tmp_path / "declared", "--nodata", collar, "--json")
+        assert re.fullmatch(rf"{path}: \d\d % of the pixels are exactly {border}, .* give --nodata {border}", line)
+    declared = invoke("rectify", left, right, tmp_path / "declared", "--nodata", border, "--json")
     assert json.loads(declared.stdout)["warnings"] == []
-    twice = invoke("rectify", left, left, tmp_path / "twice", "--nodata", collar, "--right-model", right)
+    twice = invoke("rectify", left, left, tmp_path / "twice", "--nodata", border, "--right-model", right)
     assert f"{left} and {left} have the same pixels: give the left and the right image" in twice.stderr
 
 
 def test_surface_and_batch__are_strict_about_the_raw_images(raw, tmp_path):
-    left, right = _with_collar(tmp_path, raw, 7)
+    left, right = _with_undeclared_border(tmp_path, raw, 7)
     words = "--disparity", -60, 20, "--strict", "--quiet"
     result = invoke("surface", left, right, tmp_path / "out", *SETTINGS, *words)
     (tmp_path / "pairs.csv").write_text(f"name,left,right,minimum,maximum,resolution\npair,{left},{right},-60,20,0.5\n")

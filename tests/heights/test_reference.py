@@ -187,7 +187,7 @@ def test_make_truth__does_not_depend_on_tiles_or_the_search_range(tmp_path, monk
     reference = write_heights(tmp_path / "high.tif", on_ground(lambda row, column: hills(row, column) + 40))
     whole, report = truth_of(out, files, reference, registers=False)
     assert report["outside_range"] == 1
-    monkeypatch.setattr("sat_intervals.heights.raster_sight._TILE", 32)
+    monkeypatch.setattr("sat_intervals.heights.raster_visibility._TILE", 32)
     monkeypatch.setattr("sat_intervals.raster.heightfield._BLOCK", 37)
     tiled, _ = truth_of(out, files, reference, registers=False)
     np.testing.assert_allclose(tiled, whole, atol=1e-4)

@@ -20,7 +20,7 @@ from rasterio.warp import reproject
 from sat_intervals import SatIntervalsError, match_pair
 from sat_intervals.demo import DATUM, PIXEL, VIEWS, make_scene
 from sat_intervals.heights.dsm import make_surface
-from sat_intervals.kernels.rows import RowOffsets
+from sat_intervals.kernels.row_offsets import RowOffsets
 from sat_intervals.products import INVALID, POINTS
 from sat_intervals.raster import Projection
 from sat_intervals.results import open_run

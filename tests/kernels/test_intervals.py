@@ -15,7 +15,7 @@ from sat_intervals.kernels.intervals import regularize
 from sat_intervals.kernels.matching import match_costs
 from sat_intervals.kernels.sweeps import Settings
 from sat_intervals.match.costs import cost_of
-from sat_intervals.match.patch import Frame, match_patch, patch_areas
+from sat_intervals.match.patch import PatchFrame, match_patch, patch_areas
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_rows
 from sat_intervals.prepare.in_memory import match_arrays
 from sat_intervals.products import BOUND_STEPS, IMPOSSIBLE_COST, INVALID, NO_BOUND, NO_DATA, NO_DISPARITY, REJECTED
@@ -323,7 +323,7 @@ def check(bands, validity, expected, config):
 @given(seed=st.integers(0, 2**32 - 1), config=configs(), holes=st.integers(0, 3))
 def test_postprocess_rows__of_a_patch_equals_reference(seed, config, holes):
     left, right, left_state, right_state = image_pair(seed, config.disparity, holes)
-    frame = Frame.of_whole(Window(0, 0, *left.shape))
+    frame = PatchFrame.of_whole(Window(0, 0, *left.shape))
     cost, areas = cost_of(config), patch_areas(frame, config)
     windows = cost.windows(areas)
     views = view(left, left_state, windows[0]), view(right, right_state, windows[1])

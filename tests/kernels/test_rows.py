@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from sat_intervals.kernels.rows import AFTER, BEFORE, RowOffsets, shift_equations, shift_rows
+from sat_intervals.kernels.row_offsets import AFTER, BEFORE, RowOffsets, shift_equations, shift_rows
 
 
 def cubic(t):

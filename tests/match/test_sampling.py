@@ -1,10 +1,10 @@
-"""Looks at blocks of a pair: noise and row offsets."""
+"""Matches of sample blocks of a pair: noise and row offsets."""
 
 import numpy as np
 import pytest
 
 from sat_intervals.demo import make_scene
-from sat_intervals.match.sampling import look, noise_of, spots
+from sat_intervals.match.sampling import block_match, noise_of, sample_blocks
 from sat_intervals.match.whole import cut, whole_view
 from sat_intervals.tiling import Window
 
@@ -16,8 +16,8 @@ def scene():
 
 def looks_at(left, right, scene):
     views = [whole_view(np.ma.masked_equal(image, 0).astype(np.float32)) for image in (left, right)]
-    chosen = spots(views[0].window, scene.minimum, scene.maximum)
-    found = (look(spot, *map(cut, views, spot.views)) for spot in chosen)
+    chosen = sample_blocks(views[0].window, scene.minimum, scene.maximum)
+    found = (block_match(sample, *map(cut, views, sample.views)) for sample in chosen)
     return [one for one in found if one is not None]
 
 
@@ -47,8 +47,8 @@ def test_look__sees_nothing_in_empty_images(scene):
 def test_spots__cover_a_region_and_stay_inside():
     for height, width, number in ((100, 700, 5), (256, 256, 1), (5000, 5000, 25)):
         region = Window(30, 40, height, width)
-        chosen = spots(region, -5, 9)
+        chosen = sample_blocks(region, -5, 9)
         assert len(chosen) == number
-        assert all(spot.left.clipped(region) == spot.left for spot in chosen)
+        assert all(sample.left.clipped(region) == sample.left for sample in chosen)
         assert chosen[0].left.row == 30
         assert chosen[-1].left.column_stop == 40 + width

@@ -11,7 +11,7 @@ import yaml
 from helpers import PLACE, invoke, write_pair
 
 from sat_intervals import SatIntervalsError, match_pair, open_image
-from sat_intervals.cli.calibrate import _Judging, _subjects
+from sat_intervals.cli.calibrate import _Judging, _scenes
 from sat_intervals.cli.matching import SettingsArguments
 from sat_intervals.config import PRESETS, Cluster, calibration_of, load_calibration, load_config
 from sat_intervals.config.calibration import COVERAGES
@@ -19,9 +19,9 @@ from sat_intervals.demo import make_scene
 from sat_intervals.errors import ChangedInputError
 from sat_intervals.evaluate.disparity import evaluate_run
 from sat_intervals.raster import write_layer
-from sat_intervals.run.calibrate import check_subjects
+from sat_intervals.run.calibrate import check_scenes
 from sat_intervals.run.job import open_job
-from sat_intervals.run.measure import Subject, measure_subjects, truth_of
+from sat_intervals.run.measure import CalibrationScene, measure_scenes, truth_of
 
 
 @pytest.fixture(scope="module")
@@ -158,24 +158,24 @@ def test_calibrate__mistaken_arguments_are_one_line(scene, tmp_path):
     assert not (tmp_path / "new.yaml").exists()
 
 
-def test_measure_subjects__deletes_the_tiles_of_a_killed_calibration(scene, tmp_path):
-    subjects = _subjects((scene,), (), _Judging(SettingsArguments(None, {}), 0.0, False, False))
+def test_measure_scenes__deletes_the_tiles_of_a_killed_calibration(scene, tmp_path):
+    scenes = _scenes((scene,), (), _Judging(SettingsArguments(None, {}), 0.0, False, False))
     left = tmp_path / "left"
 
     def keep(stage, done, total):
         if stage == "tiles" and not left.exists():
             copytree(tmp_path / ".calibrate", left)
 
-    measure_subjects(subjects, tmp_path, keep)
+    measure_scenes(scenes, tmp_path, keep)
     assert list(left.rglob("manifest.json"))
     left.rename(tmp_path / ".calibrate")
-    measure_subjects(subjects, tmp_path, lambda stage, done, total: None)
+    measure_scenes(scenes, tmp_path, lambda stage, done, total: None)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_measure_subjects__ends_where_an_image_changes(scene, tmp_path):
+def test_measure_scenes__ends_where_an_image_changes(scene, tmp_path):
     pair = copytree(scene, tmp_path / "pair")
-    subjects = _subjects((pair,), (), _Judging(SettingsArguments(None, {}), 0.0, False, False))
+    scenes = _scenes((pair,), (), _Judging(SettingsArguments(None, {}), 0.0, False, False))
 
     def change(stage, done, total):
         if stage == "tiles":
@@ -183,7 +183,7 @@ def test_measure_subjects__ends_where_an_image_changes(scene, tmp_path):
                 file.write(np.ones(file.shape, file.dtypes[0]), 1)
 
     with pytest.raises(ChangedInputError, match=r"left\.tif was changed during the run \(left\.\w+ was"):
-        measure_subjects(subjects, tmp_path, change)
+        measure_scenes(scenes, tmp_path, change)
     assert list(tmp_path.iterdir()) == [pair]
 
 
@@ -209,11 +209,11 @@ def test_calibrate__a_run_with_local_ranges_is_matched_over_its_whole_range(scen
     assert found["levels"] == yaml.safe_load((scene / "calibration.yaml").read_text())["levels"]
 
 
-def test_check_subjects__needs_the_search_range_as_numbers(scene):
+def test_check_scenes__needs_the_search_range_as_numbers(scene):
     left, right = (open_image(scene / f"{side}.tif") for side in ("left", "right"))
-    subject = Subject("one", "one", left, right, truth_of(left, scene / "truth.tif"), load_config({}))
+    scene = CalibrationScene("one", "one", left, right, truth_of(left, scene / "truth.tif"), load_config({}))
     with pytest.raises(SatIntervalsError, match="one: the search range is auto, but calibrate needs it as numbers"):
-        check_subjects([subject])
+        check_scenes([scene])
 
 
 def test_calibrate__levels_out_of_order_are_refused(scene, tmp_path):
@@ -258,11 +258,11 @@ def test_calibrate__a_run_is_matched_again_on_this_machine(scene, tmp_path):
     settings = settings_with(scene) | {"cluster": {"workers": 2, "store": str(tmp_path / "store")}}
     match_pair(scene / "left.tif", scene / "right.tif", tmp_path / "out", settings)
     for given in ({}, {"cluster": {"workers": 1}}):
-        (subject,) = _subjects((tmp_path / "out",), (), _Judging(SettingsArguments(None, given), 0.0, False, False))
-        assert subject.config.cluster == Cluster(**given.get("cluster", {}))
+        (scene,) = _scenes((tmp_path / "out",), (), _Judging(SettingsArguments(None, given), 0.0, False, False))
+        assert scene.config.cluster == Cluster(**given.get("cluster", {}))
 
 
-def test_check_subjects__needs_another_group_to_judge_with(scene, tmp_path):
+def test_check_scenes__needs_another_group_to_judge_with(scene, tmp_path):
     folders = [tmp_path / "one", tmp_path / "other"]
     for folder in folders:
         copytree(scene, folder)
@@ -280,14 +280,14 @@ def test_calibrate__warns_of_a_truth_in_whole_pixels(scene, tmp_path, tolerance)
     assert ("pair has whole pixels only: try --tolerance 0.5" in done.stderr) == (tolerance == 0)
 
 
-def test_check_subjects__refuses_a_scene_that_counts_twice(scene, tmp_path):
+def test_check_scenes__refuses_a_scene_that_counts_twice(scene, tmp_path):
     for out in (tmp_path / "one", tmp_path / "other"):
         match_pair(scene / "left.tif", scene / "right.tif", out, settings_with(scene, coverage=0.9))
     line = one_line(invoke("calibrate", tmp_path / "one", tmp_path / "other", "--output", tmp_path / "new.yaml"))
     assert f"{tmp_path}/one and {tmp_path}/other are the same scene: give each scene once" in line
-    (one,) = _subjects((scene,), (), _Judging(SettingsArguments(None, {}), 0.0, False, False))
+    (one,) = _scenes((scene,), (), _Judging(SettingsArguments(None, {}), 0.0, False, False))
     third = open_image(copytree(scene, tmp_path / "third") / "right.tif")
-    check_subjects([one, dataclasses.replace(one, name="a triplet", group="another", right=third)])
+    check_scenes([one, dataclasses.replace(one, name="a triplet", group="another", right=third)])
 
 
 MCCNN = [pytest.param(preset, marks=pytest.mark.peer("onnxruntime")) for preset in PRESETS if "mccnn" in preset]

@@ -20,7 +20,7 @@ def scene():
 
 
 def lows(scene, folder, side):
-    """A side of the pair whose smallest value is that of its collar."""
+    """A side of the pair whose smallest value is that of its undeclared_border."""
     pixels = getattr(scene, side).astype(np.uint16) + 2000
     pixels[:, :55] = 777
     write_layer(folder / f"{side}.tif", pixels, None, PLACE)

@@ -35,11 +35,11 @@ from sat_intervals.raster import RUN_FILES, OutputWriter, read_layers, surface_f
 from sat_intervals.results import open_results
 from sat_intervals.show import maps
 from sat_intervals.show.cost_curve import read_curve
-from sat_intervals.show.dsm import _relief, draw_surface
 from sat_intervals.show.legend import ORANGE, PIXEL_CLASSES, SKY, VERMILION, class_counts, classify
 from sat_intervals.show.maps import draw_errors, draw_overview
+from sat_intervals.show.preparation import draw_rows
 from sat_intervals.show.profile import draw_curve, draw_profile
-from sat_intervals.show.search_range import draw_rows
+from sat_intervals.show.surface_map import _relief, draw_surface
 from sat_intervals.tiling import Window
 
 WHITE, GREY = (255, 255, 255), (222, 222, 222)
@@ -384,7 +384,7 @@ def test_draw_rows__colours_are_those_of_most_places(tmp_path, monkeypatch):
     offsets = np.append(random.normal(1.2, 0.1, 20), [15.1, -14.7])
     places = np.stack([random.uniform(0, 60, 22), random.uniform(0, 80, 22), offsets, offsets - 1.2], axis=1)
     out = write_run(tmp_path, *random_bands(60, 80))
-    rows = {"before": [1.2, 1.4], "after": [0.1, 13.0], "looks": places.tolist()}
+    rows = {"before": [1.2, 1.4], "after": [0.1, 13.0], "samples": places.tolist()}
     results = open_results(out)
     results.report["survey"] = {"rows": rows}
     scatter = Axes.scatter

@@ -245,9 +245,9 @@ def test_page__of_a_run_without_intervals_claims_none(browser, tmp_path):
 def test_page__draws_the_offsets_of_the_rows(browser, tmp_path):
     out = write_run(tmp_path, *random_bands(60, 80))
     report = json.loads((out / "run.json").read_text())
-    looks = [[10, 20, 1.25, -0.05], [40, 60, 1.5, 0.1]]
+    samples = [[10, 20, 1.25, -0.05], [40, 60, 1.5, 0.1]]
     report |= {
-        "survey": {"rows": {"before": [1.4, 1.5], "after": [0.08, 0.1], "looks": looks}},
+        "survey": {"rows": {"before": [1.4, 1.5], "after": [0.08, 0.1], "samples": samples}},
         "rows": {"coefficients": [1.4], "rows": 60, "columns": 80},
     }
     (out / "run.json").write_text(json.dumps(report))

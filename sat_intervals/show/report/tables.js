@@ -135,7 +135,7 @@ function showSearch() {
   const rows = [
     ["distance of matches, 1 = random pixels", quality.noise === null ? "none" : fixed(quality.noise, 2)],
     ["rows of the two images", run.survey?.rows ? rowsSentence(run.survey.rows) : "not compared"],
-    ...Object.entries(quality.collars).map(([side, collar]) => [`border of the ${side} image`, `${percent(collar.share)} of its pixels are ${short(collar.value)}`]),
+    ...Object.entries(quality.undeclared).map(([side, undeclared_border]) => [`border of the ${side} image`, `${percent(undeclared_border.share)} of its pixels are ${short(undeclared_border.value)}`]),
   ];
   place.append(table([], rows));
   if (run.survey?.rows) showRows(place, run.survey.rows);
@@ -147,14 +147,14 @@ function rowsSentence({ before: [median], after: [left] }) {
 }
 
 /** Draw the row offsets of the places that were compared, and what the function leaves of them, as numbers. */
-function showRows(place, { looks }) {
+function showRows(place, { samples }) {
   const done = run.rows ? "taken out of the right image" : "left as they are";
   const figures = [[2, `Row offset (px), ${done}`], [3, "What a smooth function leaves of it (px)"]].map(([part, title]) => {
     const figure = element("figure", {}, element("h3", {}, title));
     drawing(figure, 260, title, (width) => {
       const { width: across, height } = run.inputs.right;
       const { x, y, parts } = chart(width, 260, [0, across], [height, 0], { across: "column", up: "row", up_ticks: ticks(0, height, 5) });
-      return [...parts, ...looks.map((look) => svg("text", { x: x(look[1]), y: y(look[0]) + 4, "text-anchor": "middle" }, fixed(look[part], 2)))];
+      return [...parts, ...samples.map((sample) => svg("text", { x: x(sample[1]), y: y(sample[0]) + 4, "text-anchor": "middle" }, fixed(sample[part], 2)))];
     });
     return figure;
   });

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.results import Results
-from sat_intervals.show.canvas import DPI, INK, Frame, MapLayer, draw_layer, page
+from sat_intervals.show.canvas import DPI, INK, MapLayer, PlotFrame, draw_layer, page
 from sat_intervals.show.legend import BLUE, SKY
 
 # Pixels of offset at the ends of the colours of row offsets, at least, and places within them: wrong ones lie beyond.
@@ -39,7 +39,7 @@ def draw_range(results: Results, target: Path, dpi: int = DPI) -> None:
         if local:
             ranges = LocalRanges.of_report(local)
             rows, columns = ranges.minimum.shape
-            frame = Frame.of((ranges.height * rows, ranges.width * columns))
+            frame = PlotFrame.of((ranges.height * rows, ranges.width * columns))
             used = "" if report.get("local_ranges") else ", not used"
             share = f": {100 * ranges.share:.0f} % searched"
             for title, ends in (("minimum" + used, ranges.minimum), ("maximum" + used + share, ranges.maximum)):
@@ -68,7 +68,7 @@ def has_rows(results: Results) -> bool:
 def draw_rows(results: Results, target: Path, dpi: int = DPI) -> None:
     """Draw the row offsets at the places that were looked at, and what the function leaves of them, in pixels."""
     found = results.report["survey"]["rows"]
-    row, column, before, after = np.array(found["looks"]).T
+    row, column, before, after = np.array(found["samples"]).T
     done = "taken out of the right image" if results.rows else "left as they are"
     title = (
         f"{Path(results.right.path).name}: rows differ by {found['before'][0]:.2f} px in the median, "

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from sat_intervals.kernels.splat import BOUNDED, empty_cells, gather, mean_heights, medians, splat
+from sat_intervals.kernels.gridding import BOUNDED, empty_cells, gather, mean_heights, medians, splat
 
 
 @settings(max_examples=60)

@@ -18,7 +18,7 @@ _TOLERANCE = 1e-5
 
 
 @dataclass(frozen=True)
-class Foreign:
+class ExternalVolume:
     """A volume of another matcher.
 
     values: ``(rows, columns, disparities)``, not finite where a candidate is impossible.
@@ -72,7 +72,7 @@ class Foreign:
         return {"method": "volume", "kind": self.kind, "span": span, "lowest": self.lowest}
 
 
-def open_foreign(volume: Any, disparities: Any, kind: str | None, span: Any) -> Foreign:
+def open_external(volume: Any, disparities: Any, kind: str | None, span: Any) -> ExternalVolume:
     """Check what describes a volume; see `intervals_of`."""
     attributes: dict[str, Any] = {}
     if isinstance(volume, xr.Dataset):
@@ -97,7 +97,7 @@ def open_foreign(volume: Any, disparities: Any, kind: str | None, span: Any) -> 
         raise ConfigError(f"kind is {kind}: give cost, similarity or probability")
     labels = xr.DataArray(np.empty(values.shape[:2], np.bool_), coordinates, ("y", "x"))
     ends = _ends(kind, span, attributes.get("cmax"))
-    return Foreign(values, _spaced(disparities, values.shape[2]), labels, kind, *ends)
+    return ExternalVolume(values, _spaced(disparities, values.shape[2]), labels, kind, *ends)
 
 
 def _in_order(volume: xr.DataArray) -> tuple[xr.DataArray, Hashable]:

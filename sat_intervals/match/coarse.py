@@ -74,7 +74,7 @@ class Found:
     matched: share of the usable left pixels with a consistent match at the finest level.
     levels: from coarse to fine.
     histogram: matches of the finest level between the first and the last disparity: ``edges`` in pixels and ``counts``.
-    collars: the value and share of pixels of the `collar` of an image, by side.
+    undeclared: the value and share of pixels of the `undeclared_border` of an image, by side.
     cells: the local ranges, see `LocalRanges.report`.
     """
 
@@ -83,7 +83,7 @@ class Found:
     matched: float
     levels: tuple[Level, ...]
     histogram: dict[str, list[float]] = field(default_factory=dict)
-    collars: dict[str, Any] = field(default_factory=dict)
+    undeclared: dict[str, Any] = field(default_factory=dict)
     cells: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -187,7 +187,7 @@ def _coarser(image: np.ndarray, step: Step) -> np.ndarray:
     return reduced(np.where(state, np.float32(0), image), state.view(np.uint8), step)
 
 
-def collar(image: np.ndarray, smallest: float) -> np.ndarray:
+def undeclared_border(image: np.ndarray, smallest: float) -> np.ndarray:
     """Pixels of a level that have only the smallest value and reach the border of the image along a row or column.
 
     ``image`` is float32; ``smallest`` is the smallest usable value. Returns bool of the same shape.

@@ -12,7 +12,7 @@ from rasterio.transform import Affine
 from surfaces import PLACE, write_raster, write_surface
 
 from sat_intervals import SatIntervalsError
-from sat_intervals.evaluate.dsm import evaluate_surface
+from sat_intervals.evaluate.surface_accuracy import evaluate_surface
 from sat_intervals.match.histogram import Histogram
 
 

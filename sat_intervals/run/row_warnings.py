@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from sat_intervals.config import load_config
-from sat_intervals.match.search_range import NoRangeError
+from sat_intervals.match.coarse import NoRangeError
 from sat_intervals.prepare.pair import FilePair
 from sat_intervals.prepare.prepared import prepare
 from sat_intervals.progress import Progress

@@ -1,4 +1,4 @@
-"""How far the rows of two images differ: a smooth function of the place, fitted to looks at blocks of the pair."""
+"""How far the rows of two images differ: a smooth function of the place, fitted to sample blocks of the pair."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.kernels.rows import RowOffsets
-from sat_intervals.match.sampling import Look, noise_of
-from sat_intervals.match.search_range import Found, NoRangeError
+from sat_intervals.kernels.row_offsets import RowOffsets
+from sat_intervals.match.coarse import Found, NoRangeError
+from sat_intervals.match.sampling import BlockMatch, noise_of
 from sat_intervals.products import plain
 from sat_intervals.tiling import Window
 
-# Looks that a constant and a plane need, and each further degree per coefficient.
+# Sample blocks that a constant and a plane need, and each further degree per coefficient.
 _FEWEST, _PER_COEFFICIENT = 3, 4
 # Share of the residual that a further degree must take away.
 _BETTER = 0.7
@@ -22,12 +22,12 @@ _BETTER = 0.7
 _STEPS, _SCALE = 30, 0.05
 # Pixels of offset from which on rows are taken out, and that are searched.
 _TAKEN, _MOST = 0.3, 12.0
-# Pixels from the middle of a look to the rim of its block.
+# Pixels from the middle of a sample block to its rim.
 _HALF = 128
-# Share of matches of a look that sees the same ground in both images: in others up to .6 match by chance.
+# Share of matches of a sample block that sees the same ground in both images: in others up to .6 match by chance.
 _MATCHED = 0.62
-# Pixels of residual in a quarter of the looks from which on they have jitter, and are no epipolar pair; and in half of
-# them above which no polynomial holds, so that a constant is taken.
+# Pixels of residual in a quarter of the sample blocks from which on they have jitter, and are no epipolar pair; and in
+# half of them above which no polynomial holds, so that a constant is taken.
 _JITTER, _CONTRADICTING, _HOLDING = 0.3, 4.0, 0.5
 
 
@@ -36,9 +36,9 @@ class RowFit:
     """The row offsets of a pair with their evidence, in pixels.
 
     offsets, matches, most: the function, how many matches were measured, and its largest value in the region.
-    before, after: median and 90 % quantile of the sizes of offsets of the looks, and of what is left of them.
-    looks: row, column of the right image, offset, and what the function, fitted to the other half, leaves of it.
-    share: of the looks that were measured, those that match; without any the others are here, to judge the pair.
+    before, after: median and 90 % quantile of the sizes of offsets of the samples, and of what is left of them.
+    samples: row, column of the right image, offset, and what the function, fitted to the other half, leaves of it.
+    share: of the samples that were measured, those that match; without any the others are here, to judge the pair.
     """
 
     offsets: RowOffsets
@@ -46,7 +46,7 @@ class RowFit:
     most: float
     before: tuple[float, float]
     after: tuple[float, float]
-    looks: tuple[tuple[float, float, float, float], ...]
+    samples: tuple[tuple[float, float, float, float], ...]
     share: float
 
     @property
@@ -56,12 +56,12 @@ class RowFit:
 
     @property
     def _scatter(self) -> float:
-        return float(np.quantile([abs(look[3]) for look in self.looks], 0.75))
+        return float(np.quantile([abs(sample[3]) for sample in self.samples], 0.75))
 
     @property
     def farthest(self) -> float:
         """Return the largest offset that was measured, in pixels."""
-        return max(abs(look[2]) for look in self.looks)
+        return max(abs(sample[2]) for sample in self.samples)
 
     @property
     def kind(self) -> str:
@@ -73,7 +73,7 @@ class RowFit:
         """Return why the pair is not epipolar, and the way out: offsets are large, or contradict each other."""
         if self.before[0] <= _MOST and self.most <= 2 * _MOST and self._scatter <= _CONTRADICTING:
             return None
-        lower = np.median([look[2] for look in self.looks])
+        lower = np.median([sample[2] for sample in self.samples])
         return (
             f"not an epipolar pair: rows differ by {self.before[0]:.1f} px in the median, at most {self.farthest:.1f}, "
             f"and by {self.after[0]:.1f} px from {self.kind}, over {self.matches} matches; {_MOST:g} px are searched: "
@@ -86,12 +86,12 @@ class RowFit:
         """Read what a report of a survey has of it."""
         offsets = RowOffsets.of_report(report["offsets"])
         pairs = {name: tuple(report[name]) for name in ("before", "after")}
-        return cls(**dict(report) | pairs | {"offsets": offsets, "looks": tuple(map(tuple, report["looks"]))})
+        return cls(**dict(report) | pairs | {"offsets": offsets, "samples": tuple(map(tuple, report["samples"]))})
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What looks at blocks of a region of the left image tell of a pair, over disparities ``search``.
+    """What sample blocks of a region of the left image tell of a pair, over disparities ``search``.
 
     ``noise``, see `noise_of`, and ``rows`` are None if unknown.
     """
@@ -102,11 +102,11 @@ class Survey:
     rows: RowFit | None
 
     @classmethod
-    def of_looks(
-        cls, region: Window, search: tuple[int, int], looks: Sequence[Look], shape: tuple[int, int]
+    def of_matches(
+        cls, region: Window, search: tuple[int, int], samples: Sequence[BlockMatch], shape: tuple[int, int]
     ) -> "Survey":
-        """Return what looks tell of a pair whose right image has so many rows and columns; see `fit_rows`."""
-        return cls(region, search, noise_of(looks), fit_rows(looks, *shape))
+        """Return what samples tell of a pair whose right image has so many rows and columns; see `fit_rows`."""
+        return cls(region, search, noise_of(samples), fit_rows(samples, *shape))
 
     @property
     def is_large(self) -> bool:
@@ -142,19 +142,19 @@ class Survey:
         return cls(Window(**report["region"]), tuple(report["search"]), report["noise"], rows)
 
 
-def fit_rows(looks: Sequence[Look], rows: int, columns: int) -> RowFit | None:
-    """Fit the row offsets of looks at a pair; ``rows`` and ``columns`` are those of the right image.
+def fit_rows(samples: Sequence[BlockMatch], rows: int, columns: int) -> RowFit | None:
+    """Fit the row offsets of sample blocks of a pair; ``rows`` and ``columns`` are those of the right image.
 
-    Of polynomials the one of the lowest degree is taken unless a higher one leaves clearly less in looks that it was
-    not fitted to; a constant where none holds. None with fewer than three looks.
+    Of polynomials the one of the lowest degree is taken unless a higher one leaves clearly less in samples that it was
+    not fitted to; a constant where none holds. None with fewer than three samples.
     """
-    matching = [look for look in looks if look.share >= _MATCHED]
-    share, looks = len(matching) / max(1, len(looks)), matching or looks
-    if len(looks) < _FEWEST:
+    matching = [sample for sample in samples if sample.share >= _MATCHED]
+    share, samples = len(matching) / max(1, len(samples)), matching or samples
+    if len(samples) < _FEWEST:
         return None
-    row, column, offset = np.array([(look.row, look.column, look.rows) for look in looks]).T
+    row, column, offset = np.array([(sample.row, sample.column, sample.rows) for sample in samples]).T
     nothing = RowOffsets((), rows, columns)
-    counts = [1, *(count for count in (3, 6, 10) if len(looks) >= _PER_COEFFICIENT * count)]
+    counts = [1, *(count for count in (3, 6, 10) if len(samples) >= _PER_COEFFICIENT * count)]
     left = {count: _left_by_others(nothing.design(row, column, count), offset) for count in counts}
     best = counts[0]
     for count in counts[1:]:
@@ -163,7 +163,7 @@ def fit_rows(looks: Sequence[Look], rows: int, columns: int) -> RowFit | None:
     best = best if np.median(np.abs(left[best])) <= _HOLDING else 1
     found = _fit(nothing.design(row, column, best), offset)
     offsets = RowOffsets(tuple(round(float(value), 6) for value in found), rows, columns)
-    # the looks are the middles of blocks
+    # the samples are the middles of blocks
     around = [
         np.linspace(max(0, places.min() - _HALF), min(size - 1, places.max() + _HALF), 9)
         for places, size in ((row, rows), (column, columns))
@@ -173,7 +173,7 @@ def fit_rows(looks: Sequence[Look], rows: int, columns: int) -> RowFit | None:
     places = np.stack([row, column, offset, left[best]], axis=1).round(3)
     return RowFit(
         offsets,
-        sum(look.number for look in looks),
+        sum(sample.number for sample in samples),
         round(most, 3),
         (_rounded(before, 0.5), _rounded(before, 0.9)),
         (_rounded(after, 0.5), _rounded(after, 0.9)),
@@ -187,7 +187,7 @@ def _rounded(sizes: np.ndarray, share: float) -> float:
 
 
 def _left_by_others(design: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """Return what fits to one half of the looks leave of the offsets of the other half."""
+    """Return what fits to one half of the samples leave of the offsets of the other half."""
     half = np.arange(len(offset)) % 2 == 0
     left = np.empty(len(offset))
     for part in (half, ~half):
@@ -196,7 +196,7 @@ def _left_by_others(design: np.ndarray, offset: np.ndarray) -> np.ndarray:
 
 
 def _fit(design: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """Fit coefficients by least squares, reweighted (Cauchy) so that wrong looks hardly count."""
+    """Fit coefficients by least squares, reweighted (Cauchy) so that wrong samples hardly count."""
     weights = np.ones(len(offset))
     found: np.ndarray = np.zeros(design.shape[1])
     for _ in range(_STEPS):

@@ -10,7 +10,7 @@ from helpers import hashes, invoke, write_pair
 
 from sat_intervals import SatIntervalsError, match_arrays, match_pair
 from sat_intervals.demo import make_scene
-from sat_intervals.kernels.rows import RowOffsets, shift_rows
+from sat_intervals.kernels.row_offsets import RowOffsets, shift_rows
 from sat_intervals.raster import north_up, open_image, read_window, write_layer
 from sat_intervals.results import open_results
 from sat_intervals.tiling import Window

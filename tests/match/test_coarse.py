@@ -5,14 +5,14 @@ import pytest
 
 from sat_intervals import load_config, match_arrays
 from sat_intervals.demo import make_scene
-from sat_intervals.match.search_range import (
+from sat_intervals.match.coarse import (
     Found,
     NoRangeError,
     Step,
-    collar,
     find_range,
     finest_step,
     reduced,
+    undeclared_border,
     with_range,
 )
 
@@ -77,13 +77,13 @@ def test_reduced__averages_usable_pixels_where_half_of_a_block_is_usable():
     assert reduced(pixels, np.zeros(pixels.shape, np.uint8), Step(1, 2)).tolist() == [[1.5, 4.0], [1.5, 0.0]]
 
 
-def test_collar__reaches_the_border():
+def test_undeclared_border__reaches_the_border():
     image = np.ones((5, 6), np.float32)
     image[:, 0] = image[2, 3] = image[4, 3:] = 0
-    found = collar(image, 0.0)
+    found = undeclared_border(image, 0.0)
     assert found.sum() == 8
     assert not found[2, 3]
-    assert not collar(image, np.inf).any()
+    assert not undeclared_border(image, np.inf).any()
 
 
 def test_fitted__has_no_more_disparities_than_the_right_image_has_columns(scene):

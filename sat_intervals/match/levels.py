@@ -1,6 +1,6 @@
-"""Choose the levels of a calibration from intervals that were measured at a ladder of levels (docs/coverage.md).
+"""Choose the levels of a calibration from intervals that were measured at a sweep of thresholds (docs/coverage.md).
 
-Coverages are known at the rungs of the ladder, and interpolated between them. See `measurement` for the letters of
+Coverages are known at the thresholds of the sweep, and interpolated between them. See `measurement` for the letters of
 shapes.
 """
 
@@ -21,9 +21,9 @@ from sat_intervals.match.measurement import (
     QUANTILES,
     WIDTH,
     WIDTHS,
-    Ladders,
     Measured,
-    ladders,
+    ThresholdSweep,
+    threshold_sweep,
 )
 
 _USUAL_QUANTILE = 0.9
@@ -34,7 +34,7 @@ _SAME_SCORE = 1.02
 class Pool(NamedTuple):
     """Several measurements together.
 
-    table: weighted sums ``(rungs, schemes, fields)``.
+    table: weighted sums ``(thresholds, schemes, fields)``.
     pixels: number of pixels of high and of low confidence.
     """
 
@@ -56,10 +56,10 @@ def calibration_of_parts(
 
     ``pairs`` are for the provenance; ``key`` names the settings, see `key_of`.
     """
-    rungs, pool, expected, notes = ladders(config), pooled(parts), [], []
+    thresholds, pool, expected, notes = threshold_sweep(config), pooled(parts), [], []
     chosen: list[Levels] = []
-    for coverage, groups in zip(COVERAGES, left_out(parts, rungs, COVERAGES), strict=True):
-        levels, doubts = choose(pool, rungs, coverage)
+    for coverage, groups in zip(COVERAGES, left_out(parts, thresholds, COVERAGES), strict=True):
+        levels, doubts = choose(pool, thresholds, coverage)
         levels = not_below(levels, chosen[-1] if chosen else None)
         chosen.append(levels.model_copy(update={"high": round(levels.high, 3), "low": round(levels.low, 2)}))
         notes += [f"coverage {coverage:g}: {doubt}" for doubt in doubts]
@@ -76,7 +76,7 @@ def calibration_of_parts(
     return Calibration(name=name, key=key, levels=tuple(chosen), provenance=provenance), expected
 
 
-def choose(pool: Pool, ladders: Ladders, coverage: float) -> tuple[Levels, list[str]]:
+def choose(pool: Pool, sweep: ThresholdSweep, coverage: float) -> tuple[Levels, list[str]]:
     """Choose the levels with which each class reaches a coverage.
 
     Of the quantiles whose interval score is nearly the best, the one with the narrowest intervals is chosen. A class
@@ -89,23 +89,23 @@ def choose(pool: Pool, ladders: Ladders, coverage: float) -> tuple[Levels, list[
     (table, pixels), notes = pool, list[str]()
     needed = ceil(max(200, 10 / (1 - coverage)) - 1e-9)
     few = [number < needed for number in pixels]
-    borrows = ladders.are_one and not all(few)
+    borrows = sweep.are_one and not all(few)
     for name, other, number in zip(("high", "low"), ("low", "high"), pixels, strict=True):
         if number < needed:
             borrowed = f": the level of {other} confidence is used" if borrows else ""
             notes.append(f"{number} pixels of {name} confidence, {needed} are needed{borrowed}")
-    high = _level(table[:, HIGH + (few[0] and borrows)], ladders.high, coverage)
+    high = _level(table[:, HIGH + (few[0] and borrows)], sweep.high, coverage)
     if high is None and pixels[0]:
         notes.append("high confidence does not reach it at any level")
-    most = float(ladders.low[-1])
+    most = float(sweep.low[-1])
     low: tuple[float, float | None] | None
     if few[1] and borrows:
         low = most if high is None else high, _USUAL_QUANTILE
-    elif (low := _best(table, ladders.low, coverage)) is None and pixels[1]:
+    elif (low := _best(table, sweep.low, coverage)) is None and pixels[1]:
         notes.append("low confidence does not reach it at any level")
     reached = not any(number and level is None for number, level in zip(pixels, (high, low), strict=True))
     level, quantile = low or (most, QUANTILES[int(np.argmax(table[-1, HIGH + 1 :, INSIDE]))])  # it comes nearest
-    high = float(ladders.high[-1]) if high is None else high
+    high = float(sweep.high[-1]) if high is None else high
     return Levels(coverage=coverage, high=high, low=level, quantile=quantile, reached=reached), notes
 
 
@@ -132,7 +132,7 @@ def not_below(levels: Levels, before: Levels | None) -> Levels:
 
 
 def _level(fields: np.ndarray, levels: np.ndarray, coverage: float) -> float | None:
-    """Smallest level that reaches a coverage, between rungs as in `at_level`; None if none does."""
+    """Smallest level that reaches a coverage, between thresholds as in `at_level`; None if none does."""
     pixels = fields[0, COUNTS:].sum()
     if pixels == 0:
         return None
@@ -151,9 +151,10 @@ def _level(fields: np.ndarray, levels: np.ndarray, coverage: float) -> float | N
 
 
 def at_level(fields: np.ndarray, levels: np.ndarray, level: float) -> np.ndarray:
-    """Measurement at a level: ``(rungs, fields)`` to ``(fields,)``.
+    """Measurement at a level: ``(thresholds, fields)`` to ``(fields,)``.
 
-    Between rungs, misses fall geometrically, since they fall nearly exponentially with the level; the rest is linear.
+    Between thresholds, misses fall geometrically, since they fall nearly exponentially with the level; the
+    rest is linear.
     """
     above = int(np.clip(np.searchsorted(levels, level), 1, levels.size - 1))
     share = (level - levels[above - 1]) / (levels[above] - levels[above - 1])
@@ -173,14 +174,14 @@ def interval_score(fields: np.ndarray, coverage: float) -> float:
     return float((fields[WIDTH] + 2 / (1 - coverage) * fields[MISSED]) / pixels)
 
 
-def expected(table: np.ndarray, ladders: Ladders, levels: Levels) -> dict[str, float]:
+def expected(table: np.ndarray, sweep: ThresholdSweep, levels: Levels) -> dict[str, float]:
     """Figures with given levels: coverage of all, high and low, widths in pixels, interval score; NaN without pixels.
 
     ``table`` is that of a `Pool`.
     """
     assert levels.coverage is not None
-    high = at_level(table[:, HIGH], ladders.high, levels.high)
-    low = at_level(table[:, HIGH + 1 + QUANTILES.index(levels.quantile)], ladders.low, levels.low)
+    high = at_level(table[:, HIGH], sweep.high, levels.high)
+    low = at_level(table[:, HIGH + 1 + QUANTILES.index(levels.quantile)], sweep.low, levels.low)
     both = high + low
     if not both[COUNTS:].sum():
         return dict.fromkeys(("all", "high", "low", "mean_width", "median_width", "score"), np.nan)
@@ -199,7 +200,7 @@ def _share(fields: np.ndarray, which: int) -> float:
 
 
 def left_out(
-    parts: Sequence[Measured], ladders: Ladders, coverages: Iterable[float]
+    parts: Sequence[Measured], sweep: ThresholdSweep, coverages: Iterable[float]
 ) -> list[dict[str, dict[str, float]]]:
     """For each coverage, figures of each group, see `expected`, with the levels chosen on the others.
 
@@ -209,7 +210,7 @@ def left_out(
     own = {group: pooled(part for part in parts if part.group == group).table for group in groups}
     rest = {group: pooled(part for part in parts if part.group != group) for group in groups if len(groups) > 1}
     return [
-        {group: expected(own[group], ladders, choose(others, ladders, coverage)[0]) for group, others in rest.items()}
+        {group: expected(own[group], sweep, choose(others, sweep, coverage)[0]) for group, others in rest.items()}
         for coverage in coverages
     ]
 

@@ -12,7 +12,7 @@ from surfaces import PLACE, write_raster, write_surface
 
 from sat_intervals import SatIntervalsError
 from sat_intervals.config import load_height_calibration
-from sat_intervals.evaluate.calibration import calibrate_surface
+from sat_intervals.evaluate.surface_calibration import calibrate_surface
 
 TAGS = {
     "INTERVAL": "median",
@@ -84,7 +84,7 @@ def test_calibrate_surface__cells_count_not_heights_of_a_finer_reference(tmp_pat
 def test_calibrate_surface__of_a_sample_is_that_of_all_cells(tmp_path, monkeypatch):
     files = scene(tmp_path)
     whole = calibrate_surface(*files, "x", registers=False)
-    monkeypatch.setattr("sat_intervals.evaluate.calibration._MOST", 6000)
+    monkeypatch.setattr("sat_intervals.evaluate.surface_calibration._MOST", 6000)
     part = calibrate_surface(*files, "x", registers=False)
     assert 3000 < sum(kind.cells for kind in part.classes) <= 6000
     np.testing.assert_allclose(part.margins, whole.margins, atol=0.4)

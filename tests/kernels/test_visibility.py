@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sat_intervals.kernels.sight import seen_disparities, tops
+from sat_intervals.kernels.visibility import seen_disparities, tops
 
 NO_WALL = 1e9
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from sat_intervals.config import load_config
 from sat_intervals.config.calibration import COVERAGES, Calibration
-from sat_intervals.match.calibration import choose, expected, left_out, means, not_below, pooled
+from sat_intervals.match.levels import choose, expected, left_out, means, not_below, pooled
 from sat_intervals.match.measurement import (
     COUNTS,
     FIELDS,
@@ -17,26 +17,26 @@ from sat_intervals.match.measurement import (
     QUANTILES,
     SCHEMES,
     WIDTH,
-    Ladders,
     Measured,
-    ladders,
+    ThresholdSweep,
     measure,
+    threshold_sweep,
 )
 
 LEVELS = np.array([0.0, 1, 2, 4, 8, 16, 32, 64])
-LADDERS = Ladders(LEVELS, LEVELS)
+SWEEP = ThresholdSweep(LEVELS, LEVELS)
 PART = np.zeros(4, np.int64)
 
 
 def part(needed_high, needed_low, group="one", widen=None):
     """A measurement of pixels that need these levels; an interval is as wide as its level, or as ``widen`` tells."""
     table = np.zeros((LEVELS.size, SCHEMES, FIELDS))
-    for rung, level in enumerate(LEVELS):
+    for threshold, level in enumerate(LEVELS):
         for scheme in range(SCHEMES):
             needed = np.asarray(needed_high if scheme == HIGH else needed_low, float)
             width = np.full(needed.size, widen(scheme, level) if widen else level)
             truth = np.where(needed <= level, 0.0, width + 1)  # missed by 1 px
-            table[rung, scheme] = measure(0 * width, width, truth, 0.0, np.zeros(needed.size, int), 1)[0]
+            table[threshold, scheme] = measure(0 * width, width, truth, 0.0, np.zeros(needed.size, int), 1)[0]
     return Measured(group, 1 / (len(needed_high) + len(needed_low)), table)
 
 
@@ -53,23 +53,23 @@ def test_measure__the_widest_interval_is_counted():
 
 
 @pytest.mark.parametrize("preset", ["paper", "satellite"])
-def test_ladders__hold_every_candidate(preset):
+def test_threshold_sweep__hold_every_candidate(preset):
     config = load_config({"preset": preset, "disparity": {"minimum": 0, "maximum": 5}})
-    high, low = ladders(config)
+    high, low = threshold_sweep(config)
     assert low[-1] == pytest.approx(config.largest_sum)
-    for rungs in (high, low):
-        assert rungs[0] == 0
-        assert (np.diff(rungs) > 0).all()
-        assert rungs.size == low.size
-    assert ladders(config).are_one == (preset == "paper")
+    for thresholds in (high, low):
+        assert thresholds[0] == 0
+        assert (np.diff(thresholds) > 0).all()
+        assert thresholds.size == low.size
+    assert threshold_sweep(config).are_one == (preset == "paper")
     assert (0.1 * 0.3 * high[-1] > 500) == (preset == "satellite")
 
 
 def test_choose__factors_and_levels_have_rungs_of_their_own():
-    factors = Ladders(LEVELS / 8, LEVELS)
+    factors = ThresholdSweep(LEVELS / 8, LEVELS)
     pool = pooled([part([4] * 2000, [20] * 2000)])
     choice, _ = choose(pool, factors, 0.9)
-    one, _ = choose(pool, LADDERS, 0.9)
+    one, _ = choose(pool, SWEEP, 0.9)
     assert (8 * choice.high, choice.low) == (one.high, one.low)
     few, notes = choose(pooled([part([4] * 2000, [20] * 190)]), factors, 0.9)
     assert few.low > 16  # not that of the other class, which is a factor
@@ -82,36 +82,36 @@ def test_choose__each_class_reaches_the_coverage_by_the_smallest_level(seed, cov
     random = np.random.default_rng(seed)
     parts = [part(random.exponential(4, 1500), random.exponential(9, 1200), str(i)) for i in range(2)]
     pool = pooled(parts)
-    choice, notes = choose(pool, LADDERS, coverage)
-    figures = expected(pool.table, LADDERS, choice)
+    choice, notes = choose(pool, SWEEP, coverage)
+    figures = expected(pool.table, SWEEP, choice)
     assert not notes
     assert choice.reached
     for name in ("high", "low"):
         assert figures[name] == pytest.approx(coverage, abs=1e-6)
-    higher, _ = choose(pool, LADDERS, coverage + 0.005)
+    higher, _ = choose(pool, SWEEP, coverage + 0.005)
     assert higher.high > choice.high
 
 
 def test_choose__every_pair_weighs_the_same():
     large, small = part([1] * 9000, [1] * 9000), part([20] * 600, [1] * 600)
-    choice, _ = choose(pooled([large, small]), LADDERS, 0.75)
+    choice, _ = choose(pooled([large, small]), SWEEP, 0.75)
     assert 16 < choice.high <= 32  # half of the weight, though a fifteenth of the pixels
 
 
 def test_choose__a_class_with_few_pixels_takes_the_level_of_the_other():
     pool = pooled([part([4] * 2000, [20] * 190)])
-    choice, notes = choose(pool, LADDERS, 0.9)
+    choice, notes = choose(pool, SWEEP, 0.9)
     assert choice.high == choice.low <= 4
     assert choice.quantile == 0.9
     assert notes == ["190 pixels of low confidence, 200 are needed: the level of high confidence is used"]
     pool = pooled([part([4] * 900, [20] * 1200)])
-    at_975, notes = choose(pool, LADDERS, 0.975)
+    at_975, notes = choose(pool, SWEEP, 0.975)
     assert not notes
-    choice, notes = choose(pool, LADDERS, 0.99)
+    choice, notes = choose(pool, SWEEP, 0.99)
     assert choice.high > 16
     assert choice.low > at_975.low > 31  # its own
     assert notes == ["900 pixels of high confidence, 1000 are needed: the level of low confidence is used"]
-    both, notes = choose(pooled([part([4] * 900, [20] * 900)]), LADDERS, 0.99)
+    both, notes = choose(pooled([part([4] * 900, [20] * 900)]), SWEEP, 0.99)
     assert both.high <= 4
     assert [note.split()[:4] for note in notes] == [["900", "pixels", "of", name] for name in ("high", "low")]
 
@@ -122,7 +122,7 @@ def test_not_below__levels_of_a_class_with_few_pixels_do_not_fall(pixels):
     pool = pooled([part(random.exponential(40, pixels[0]), random.exponential(8, pixels[1]))])
     choice, chosen = None, []
     for coverage in COVERAGES:
-        choice = not_below(choose(pool, LADDERS, coverage)[0], choice)
+        choice = not_below(choose(pool, SWEEP, coverage)[0], choice)
         chosen.append(choice)
     Calibration(name="few", key={}, levels=tuple(chosen))
 
@@ -130,12 +130,12 @@ def test_not_below__levels_of_a_class_with_few_pixels_do_not_fall(pixels):
 def test_choose__says_what_no_level_reaches():
     """Truths outside the search range are missed at any level."""
     pool = pooled([part([1] * 800 + [1e9] * 200, [1] * 1000)])
-    choice, notes = choose(pool, LADDERS, 0.9)
+    choice, notes = choose(pool, SWEEP, 0.9)
     assert (choice.high, choice.reached) == (LEVELS[-1], False)
     assert notes == ["high confidence does not reach it at any level"]
     low = part([1] * 1000, [1e9] * 500 + [1] * 500)
     low.table[:, 1 + QUANTILES.index(0.8), INSIDE] += 1
-    choice, notes = choose(pooled([low]), LADDERS, 0.9)
+    choice, notes = choose(pooled([low]), SWEEP, 0.9)
     assert (choice.low, choice.quantile, choice.reached) == (LEVELS[-1], 0.8, False)  # it comes nearest
     assert notes == ["low confidence does not reach it at any level"]
 
@@ -144,17 +144,17 @@ def test_choose__the_narrowest_of_nearly_the_best_scores():
     def widen(scheme, level):
         return level * {3: 0.99, 4: 1.0}.get(scheme, 2.0)
 
-    choice, _ = choose(pooled([part([4] * 1000, [4] * 1000, widen=widen)]), LADDERS, 0.9)
+    choice, _ = choose(pooled([part([4] * 1000, [4] * 1000, widen=widen)]), SWEEP, 0.9)
     assert choice.quantile == QUANTILES[3 - 1]
 
 
 def test_left_out__judges_a_group_with_levels_of_the_others():
     easy = [part([2] * 1000, [2] * 1000, "easy") for _ in range(2)]
     hard = part([30] * 1000, [2] * 1000, "hard")
-    (groups,) = left_out([*easy, hard], LADDERS, [0.9])
+    (groups,) = left_out([*easy, hard], SWEEP, [0.9])
     assert groups.keys() == {"easy", "hard"}
     assert groups["hard"]["high"] == pytest.approx(0)
     assert groups["easy"]["high"] == 1
     assert means(groups.values())["lowest"] == groups["hard"]["all"] == pytest.approx(0.45)  # of low, by interpolation
-    assert left_out(easy, LADDERS, [0.9]) == [{}]
+    assert left_out(easy, SWEEP, [0.9]) == [{}]
     assert means([]) == {}

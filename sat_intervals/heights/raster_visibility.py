@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from sat_intervals.heights.lattice import Lattice
-from sat_intervals.kernels.sight import seen_disparities, tops
+from sat_intervals.kernels.visibility import seen_disparities, tops
 from sat_intervals.raster import HeightRaster, Projection
 from sat_intervals.tiling import Window
 
@@ -25,7 +25,7 @@ class _FarError(Exception):
     """Raised when the lattice must cover more disparities; holds the new minimum and maximum."""
 
 
-class RasterSight:
+class RasterVisibility:
     """Disparities of a raster of heights, strip by strip.
 
     ``lattice_of`` returns the `Lattice` of a run over disparities from the first to the second; ``lattice``, over those

@@ -10,8 +10,8 @@ from sat_intervals.raster import is_surface, read_place, read_small_layers, read
 from sat_intervals.show.canvas import (
     DPI,
     GROUND,
-    Frame,
     MapLayer,
+    PlotFrame,
     add_histogram,
     draw_layer,
     draw_map,
@@ -47,7 +47,7 @@ def draw_surface(surface: Path, target: Path, dpi: int = DPI) -> None:
     across, down = place.pixel_size[0] * shape[1] / drawn[1], place.pixel_size[1] * shape[0] / drawn[0]
     left, top = place.transform.c, place.transform.f
     ends = left + shape[1] * place.pixel_size[0], top - shape[0] * place.pixel_size[1]
-    frame = Frame(left, *ends, top, GROUND)
+    frame = PlotFrame(left, *ends, top, GROUND)
     middle, end = _middle_and_end(halves)
     layers = [
         MapLayer("Height", "m", height, "viridis", limits(height)),
