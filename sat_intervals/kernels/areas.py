@@ -1,6 +1,6 @@
 """Maxima over low-confidence areas (METHOD.md, section 10).
 
-Letters: r row, c column, s and t segments (runs of low-confidence pixels in a row).
+Letters: s and t segments (runs of low-confidence pixels in a row).
 """
 
 import numpy as np

@@ -1,6 +1,6 @@
 """Connected components of a disparity map, whose sizes distinguish surfaces from stray matches.
 
-Letters: r row, c column; i, j row and column of the pixel that a component grows from; y, x those of its neighbour.
+Letters: i, j row and column of the pixel that a component grows from; y, x those of its neighbour.
 """
 
 import numpy as np

@@ -1,7 +1,4 @@
-"""Confidence from ambiguity (Sarrazin et al. 2021; METHOD.md, sections 4 and 8).
-
-Letters: r row, c column, k disparity index.
-"""
+"""Confidence from ambiguity (Sarrazin et al. 2021; METHOD.md, sections 4 and 8)."""
 
 import numpy as np
 

@@ -1,6 +1,6 @@
 """Matching costs from features: 1 minus the cosine of two unit vectors (Zbontar and LeCun 2016).
 
-Letters: r row, c column, k disparity index, x = c + k column of the right features, f feature.
+Letters: x = c + k column of the right features, f feature.
 """
 
 import numpy as np
@@ -44,27 +44,22 @@ def _correlate_four(here, there, c, start, curves):
 
 
 @cached
-def _correlate(left, right, steps, costs, here, there, curves):
-    rows, columns, size = costs.shape
-    for r in range(rows):
-        _copy_row(left, r, np.float32(-steps), here)
-        _copy_row(right, r, np.float32(1), there)
-        for first in range(0, columns, 4):
-            _correlate_four(here, there, first, np.float32(steps), curves)
-            for i in range(min(4, columns - first)):
-                for k in range(size):
-                    costs[r, first + i, k] = curves[i, i + k]
-
-
-def correlate(left: np.ndarray, right: np.ndarray, costs: np.ndarray) -> None:
+def correlate(left, right, costs):
     """Fill ``costs`` with ``round(COSINE_STEPS * (1 - cosine))``.
 
     left: ``(features, rows, columns)`` float32 unit vectors.
     right: ``(features, rows, columns + count - 1)``: ``right[:, r, c + k]`` faces ``left[:, r, c]``.
     costs: ``(rows, columns, size)`` uint8, 0 to 2 COSINE_STEPS; ``size`` is ``count`` padded to whole vectors.
     """
-    features, _, columns = left.shape
-    size = costs.shape[2] + LANES
-    here = np.zeros((features, columns + 3), np.float32)
-    there = np.zeros((features, columns + 3 + size), np.float32)
-    _correlate(left, right, COSINE_STEPS, costs, here, there, np.empty((4, size), np.uint8))
+    rows, columns, size = costs.shape
+    here = np.zeros((left.shape[0], columns + 3), np.float32)
+    there = np.zeros((left.shape[0], columns + 3 + size + LANES), np.float32)
+    curves = np.empty((4, size + LANES), np.uint8)
+    for r in range(rows):
+        _copy_row(left, r, np.float32(-COSINE_STEPS), here)
+        _copy_row(right, r, np.float32(1), there)
+        for first in range(0, columns, 4):
+            _correlate_four(here, there, first, np.float32(COSINE_STEPS), curves)
+            for i in range(min(4, columns - first)):
+                for k in range(size):
+                    costs[r, first + i, k] = curves[i, i + k]

@@ -1,25 +1,15 @@
 """Matching costs for SGM: Census (Zabih and Woodfill 1994; METHOD.md, section 1), or a precomputed volume.
 
-Letters: r row, c column, k disparity index (disparity = minimum + k), w word of a code.
+Letters: w word of a code.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
+from sat_intervals.kernels import vector
 from sat_intervals.kernels.compiled import cached, inlined, part
-from sat_intervals.kernels.vector import (
-    LANES,
-    add,
-    fill_where_nonzero,
-    hamming,
-    larger,
-    load,
-    load_costs,
-    splat,
-    store,
-    subtract,
-)
+from sat_intervals.kernels.vector import LANES
 from sat_intervals.tiling import Window
 
 
@@ -100,12 +90,14 @@ def _census_words(pixels, arm, words):
 
 
 @cached
-def _window_union(state, radius, union):
-    """Union of the states in each window, first along rows, then along columns.
+def window_state(state, radius):
+    """Union of the states of each window's pixels, 0 = usable: first along rows, then along columns.
 
+    ``state`` is ``(rows + 2 radius, columns + 2 radius)`` uint8; the result is ``(rows, columns)`` uint8.
     5x5 takes 0.25 ms at 600 x 600, 13 ms with one window at a time.
     """
-    rows, columns = union.shape
+    rows, columns = state.shape[0] - 2 * radius, state.shape[1] - 2 * radius
+    union = np.zeros((rows, columns), np.uint8)
     across = np.zeros((state.shape[0], columns), np.uint8)
     for r in range(state.shape[0]):
         row = across[r]
@@ -119,15 +111,6 @@ def _window_union(state, radius, union):
             other = across[r + dr]
             for c in range(columns):
                 row[c] |= other[c]
-
-
-def window_state(state: np.ndarray, radius: int) -> np.ndarray:
-    """Union of the states of each window's pixels, 0 = usable.
-
-    ``state`` is ``(rows + 2 radius, columns + 2 radius)`` uint8; the result is ``(rows, columns)`` uint8.
-    """
-    union = np.zeros((state.shape[0] - 2 * radius, state.shape[1] - 2 * radius), np.uint8)
-    _window_union(state, radius, union)
     return union
 
 
@@ -140,24 +123,23 @@ def census(pixels: np.ndarray, state: np.ndarray, window: int) -> Codes:
     Returns the codes of ``(rows, columns)`` pixels.
     """
     radius = window // 2
-    shape = pixels.shape[0] - 2 * radius, pixels.shape[1] - 2 * radius
-    neighbours = window**2 - 1
     dtype = np.uint32 if window <= 7 else np.uint64
-    count = -(-neighbours // (8 * np.dtype(dtype).itemsize))
-    words = np.zeros((count, *shape), dtype)
+    count = -(-(window**2 - 1) // (8 * np.dtype(dtype).itemsize))
+    states = window_state(state, radius)
+    words = np.zeros((count, *states.shape), dtype)
     _census_words(pixels, (0,) * radius, words)
-    return Codes(words, window_state(state, radius))
+    return Codes(words, states)
 
 
 @inlined
 def _matching_costs(left, right, r, c, k):
     """Costs of the candidates ``k .. k + 31`` of the left pixel ``(r, c)``; arrays as in `Costs`."""
     if right is None:
-        return load_costs(left, (r * left.shape[1] + c) * left.shape[2] + k)
+        return vector.load_costs(left, (r * left.shape[1] + c) * left.shape[2] + k)
     rows, width = right.shape[1:]
-    costs = hamming(right, r * width + c + k, left[0, r, c])
+    costs = vector.hamming(right, r * width + c + k, left[0, r, c])
     for w in range(1, left.shape[0]):
-        costs = add(costs, hamming(right, (w * rows + r) * width + c + k, left[w, r, c]))
+        costs = vector.add(costs, vector.hamming(right, (w * rows + r) * width + c + k, left[w, r, c]))
     return costs
 
 
@@ -243,9 +225,8 @@ def enter_cells(candidates, cells, ranges, r):
     i, number = (r + cells.row) // cells.height, cells.first.shape[1]
     for j in range(number):
         first, last = cells.first[i, j], cells.last[i, j]
-        for c in range(
-            max(0, j * cells.width - cells.column), min(ranges.first.size, (j + 1) * cells.width - cells.column)
-        ):
+        begin = j * cells.width - cells.column
+        for c in range(max(0, begin), min(ranges.first.size, begin + cells.width)):
             ranges.first[c], ranges.last[c] = first, last
             ranges.start[c], ranges.stop[c] = first // LANES * LANES, (last // LANES + 1) * LANES
             candidates.walls[c] = (i * number + j) * candidates.beyond.shape[1]
@@ -255,7 +236,8 @@ def enter_cells(candidates, cells, ranges, r):
 def candidate_costs(candidates, r, c, k):
     """Costs of the candidates ``k .. k + 31`` of a pixel, raised where they are impossible or not searched."""
     costs = _matching_costs(candidates.costs.left, candidates.costs.right, r, c, k)
-    return larger(larger(costs, load(candidates.barrier, c + k)), load(candidates.beyond, candidates.walls[c] + k))
+    barrier, beyond = vector.load(candidates.barrier, c + k), vector.load(candidates.beyond, candidates.walls[c] + k)
+    return vector.larger(vector.larger(costs, barrier), beyond)
 
 
 @inlined
@@ -268,17 +250,17 @@ def possible_count(possible, r, c, of_states):
 def closed_by_costs(possible, left, r, c, k, impossible):
     """65535 where the costs of a volume mark the candidates ``k .. k + 31`` as impossible; zeros without marks."""
     if possible is None:
-        return splat(np.uint16(0))
-    below = splat(np.uint16(impossible - 1))
-    costs = load_costs(left, (r * left.shape[1] + c) * left.shape[2] + k)
-    return fill_where_nonzero(subtract(larger(costs, below), below))
+        return vector.splat(np.uint16(0))
+    below = vector.splat(np.uint16(impossible - 1))
+    costs = vector.load_costs(left, (r * left.shape[1] + c) * left.shape[2] + k)
+    return vector.fill_where_nonzero(vector.subtract(vector.larger(costs, below), below))
 
 
 @inlined
 def cost_curve(candidates, span, r, c, curve):
     """Write the costs of the candidates of a pixel to ``curve``."""
     for k in range(span.start, span.stop, LANES):
-        store(curve, k, candidate_costs(candidates, r, c, k))
+        vector.store(curve, k, candidate_costs(candidates, r, c, k))
 
 
 def padded_to_lanes(count: int) -> int:

@@ -1,7 +1,7 @@
 """Sub-pixel refinement, cross-checking and median (METHOD.md, sections 6 and 7).
 
-Letters: r row, c column, k disparity index, d disparity (``d = minimum + k``), x column of the right image, counted
-from the one that faces the first left column at the minimum (``x = c + k``).
+Letters: d disparity, x column of the right image, counted from the one that faces the first left column at the minimum
+(``x = c + k``).
 """
 
 import numpy as np
@@ -58,7 +58,7 @@ def cross_check(winner, right_winner, minimum, tolerance):
 
 
 @inlined
-def _insert(values, count, value):
+def insert(values, count, value):
     """Insert a value into the first ``count`` values, which are sorted."""
     i = count
     while i > 0 and values[i - 1] > value:
@@ -75,7 +75,7 @@ def _median_around(values, kept, r, c, radius, window):
     for i in range(max(0, r - radius), min(rows, r + radius + 1)):
         for j in range(max(0, c - radius), min(columns, c + radius + 1)):
             if kept[i, j]:
-                _insert(window, count, values[i, j])
+                insert(window, count, values[i, j])
                 count += 1
     middle = window[count // 2]
     if count % 2 == 0:

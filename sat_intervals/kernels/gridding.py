@@ -6,6 +6,7 @@ Letters: n point; i, j row and column of a cell; u, v column and row of a point,
 import numpy as np
 
 from sat_intervals.kernels.compiled import cached, inlined
+from sat_intervals.kernels.disparity import insert
 
 # Layers of the cells.
 WEIGHT, HEIGHT, CONFIDENCE, COUNT, BOUNDED, LOWER, UPPER = range(7)
@@ -76,11 +77,7 @@ def _sort(values):
         values.sort()
         return
     for n in range(1, values.size):
-        value, place = values[n], n
-        while place > 0 and values[place - 1] > value:
-            values[place] = values[place - 1]
-            place -= 1
-        values[place] = value
+        insert(values, n, values[n])
 
 
 @cached

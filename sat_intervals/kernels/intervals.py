@@ -1,6 +1,6 @@
 """Intervals from cost curves, and their regularisation in low-confidence areas (METHOD.md, sections 5 and 8).
 
-Letters: r row, c column, k disparity index, s and t segments (runs of low-confidence pixels in a row).
+Letters: s and t segments (runs of low-confidence pixels in a row).
 """
 
 import numpy as np
@@ -11,26 +11,33 @@ from sat_intervals.products import IMPOSSIBLE_COST
 
 
 @inlined
+def first_at_most(curve, span, limit):
+    """First index whose cost is at most ``limit``: 14 ns for 64 disparities by vectors, 36 ns by single costs.
+
+    At least one cost is at most ``limit``.
+    """
+    k = span.start
+    mask = lanes_at_most(load(curve, k), limit)
+    while mask == 0:
+        k += LANES
+        mask = lanes_at_most(load(curve, k), limit)
+    return k + first_lane(mask)
+
+
+@inlined
 def alpha_cut(curve, span, limit):
     """First and last index whose cost is at most ``limit`` (paper eq. 5 to 7).
 
     It is ``lowest + floor((1 - alpha) * cost_span)``. The vectors of ``span`` have costs above every limit at other
-    candidates; at least one cost is at most ``limit``.
-    Vectors take 19 ns for 64 disparities and 38 ns for 128, single costs 70 and 129 ns.
+    candidates. Vectors take 19 ns for 64 disparities and 38 ns for 128, single costs 70 and 129 ns.
     """
-    first = span.start
-    cut = lanes_at_most(load(curve, first), limit)
-    while cut == 0:
-        first += LANES
-        cut = lanes_at_most(load(curve, first), limit)
-    first += first_lane(cut)
+    first = first_at_most(curve, span, limit)
     last = span.stop - LANES
     cut = lanes_at_most(load(curve, last), limit)
     while cut == 0:
         last -= LANES
         cut = lanes_at_most(load(curve, last), limit)
-    last += LANES - 1 - lanes_above_last(cut)
-    return first, last
+    return first, last + LANES - 1 - lanes_above_last(cut)
 
 
 @inlined

@@ -1,6 +1,6 @@
 """Trilinear interpolation on a lattice over rows, columns and disparities.
 
-Letters: r row, c column; i, j, k lattice node along rows, columns and disparities; v value.
+Letters: i, j, k lattice node along rows, columns and disparities; v value.
 """
 
 import numpy as np

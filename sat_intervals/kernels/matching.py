@@ -1,7 +1,4 @@
-"""Matching of a patch: matching costs in, products of every pixel out (METHOD.md, sections 2 to 6).
-
-Letters: r row, c column, k disparity index (disparity = minimum + k).
-"""
+"""Matching of a patch: matching costs in, products of every pixel out (METHOD.md, sections 2 to 6)."""
 
 from typing import NamedTuple
 
@@ -51,10 +48,9 @@ class RightView(NamedTuple):
 
 
 class Matched(NamedTuple):
-    """What `match_costs` returns.
+    """Products of the wanted pixels, winners of the right pixels that face the core, and what `trace` returns of LAST.
 
-    raw, right: products of the wanted pixels, winners of the right pixels that face the core.
-    leaving: states of the last of WAVEFRONTS where it leaves the patch, as `trace` returns them; empty without borders.
+    ``leaving`` is empty without borders.
     """
 
     raw: Raw
@@ -104,10 +100,7 @@ def trace(
     gradients: Gradients | None = None,
     cells: Cells | None = None,
 ) -> Edge:
-    """Path states of one wavefront where it leaves ``borders.inside``: no sums, no cost curves.
-
-    Parameters as in `match_costs`; ``wavefront`` is an index of WAVEFRONTS: only its states around are used.
-    """
+    """Path states of one of WAVEFRONTS where it leaves ``borders.inside``; parameters as in `match_costs`."""
     down, wave = WAVEFRONTS[wavefront]
     buffers = new_buffers(costs, gradients, settings, borders, cells, down)
     trace_wave(buffers, gradients, settings, wave)

@@ -3,8 +3,8 @@
 P1 and P2 of a candidate decrease where the left image, the right image, or both have an edge between the path's two
 pixels.
 
-Letters: r row, c column, k disparity index, x = c + k, i path of a sweep: 0 along the row, 1 along the falling
-diagonal, 2 along the rising one, 3 along the column.
+Letters: x = c + k, i path of a sweep: 0 along the row, 1 along the falling diagonal, 2 along the rising one, 3 along
+the column.
 """
 
 from typing import NamedTuple
@@ -67,14 +67,6 @@ def make_penalties(gradients: Gradients | None, p1: int, p2: int, columns: int, 
 
 
 @part
-def _step_back(i, down):
-    """Offset to the previous pixel of a path: rows and columns to add."""
-    row = 0 if i == 0 else 1
-    column = (1, 1, -1, 0)[i]
-    return (-row, -column) if down else (row, column)
-
-
-@part
 def _differences(image, r, row, column, differences):
     """Absolute differences of a row to the pixels at an offset; 0 where these are outside: paths start there."""
     columns = image.shape[1]
@@ -93,7 +85,9 @@ def fill_row(gradients, r, down, row):
     (left, right, rule), (p1, p2, edges) = gradients, row
     left_gradient, right_gradient = np.empty(left.shape[1], np.float32), np.empty(right.shape[1], np.float32)
     for i in range(4):
-        row_step, column_step = _step_back(i, down)
+        row_step, column_step = (0, 1, 1, 1)[i], (1, 1, -1, 0)[i]  # to the previous pixel of the path
+        if down:
+            row_step, column_step = -row_step, -column_step
         _differences(left, r, row_step, column_step, left_gradient)
         _differences(right, r, row_step, column_step, right_gradient)
         for x in range(right_gradient.size):

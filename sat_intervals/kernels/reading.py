@@ -1,30 +1,16 @@
-"""Reading of a finished cost curve: winner, refinement, interval, ambiguity, flags, and the right view's winners.
-
-Letters: r row, c column, k disparity index (disparity = minimum + k).
-"""
+"""Reading of a finished cost curve: winner, refinement, interval, ambiguity, flags, and the right view's winners."""
 
 from typing import NamedTuple
 
 import numpy as np
 
+from sat_intervals.kernels import vector
 from sat_intervals.kernels.compiled import inlined, part
 from sat_intervals.kernels.confidence import ambiguity
 from sat_intervals.kernels.cost import closed_by_costs
 from sat_intervals.kernels.disparity import vfit
-from sat_intervals.kernels.intervals import alpha_cut, subpixel_cuts
-from sat_intervals.kernels.vector import (
-    LANES,
-    choose_smaller,
-    fill_where_nonzero,
-    first_lane,
-    lanes_at_most,
-    larger,
-    load,
-    smaller,
-    smallest,
-    splat,
-    store,
-)
+from sat_intervals.kernels.intervals import alpha_cut, first_at_most, subpixel_cuts
+from sat_intervals.kernels.vector import LANES
 from sat_intervals.products import (
     IMPOSSIBLE_COST,
     LEFT_WINDOW,
@@ -75,34 +61,23 @@ def open_curve(curve, opened, span):
         return
     if opened[0] != span.start or opened[1] != span.stop:
         for k in range(0, curve.size, LANES):
-            store(curve, k, splat(np.uint16(IMPOSSIBLE_COST)))
+            vector.store(curve, k, vector.splat(np.uint16(IMPOSSIBLE_COST)))
         opened[0], opened[1] = span.start, span.stop
 
 
 @inlined
 def close_impossible(curve, candidates, span, r, c, impossible):
     """Set impossible candidates and those that are not searched to IMPOSSIBLE_COST; return the lowest cost."""
-    lowest = splat(np.uint16(IMPOSSIBLE_COST))
+    lowest = vector.splat(np.uint16(IMPOSSIBLE_COST))
     for k in range(span.start, span.stop, LANES):
-        wall = load(candidates.beyond, candidates.walls[c] + k)
-        closed = fill_where_nonzero(larger(load(candidates.barrier, c + k), wall))
+        wall = vector.load(candidates.beyond, candidates.walls[c] + k)
+        closed = vector.fill_where_nonzero(vector.larger(vector.load(candidates.barrier, c + k), wall))
         own = closed_by_costs(candidates.costs.possible, candidates.costs.left, r, c, k, impossible)
-        closed = larger(closed, own)
-        costs = larger(load(curve, k), closed)
-        store(curve, k, costs)
-        lowest = smaller(lowest, costs)
-    return smallest(lowest)
-
-
-@inlined
-def _winner(curve, span, lowest):
-    """First index with the lowest cost: 14 ns for 64 disparities by vectors, 36 ns by single costs."""
-    k = span.start
-    mask = lanes_at_most(load(curve, k), lowest)
-    while mask == 0:
-        k += LANES
-        mask = lanes_at_most(load(curve, k), lowest)
-    return k + first_lane(mask)
+        closed = vector.larger(closed, own)
+        costs = vector.larger(vector.load(curve, k), closed)
+        vector.store(curve, k, costs)
+        lowest = vector.smaller(lowest, costs)
+    return vector.smallest(lowest)
 
 
 @inlined
@@ -136,18 +111,16 @@ def update_right(curve, span, right, r, c):
     """
     start = (r - right.core.row) * right.cost.shape[1] + c - right.core.column
     for k in range(span.start, span.stop, LANES):
-        candidate, known = load(curve, k), load(right.cost, start + k)
-        best = choose_smaller(candidate, known, load(right.indices, k), load(right.best, start + k))
-        store(right.best, start + k, best)
-        store(right.cost, start + k, smaller(candidate, known))
+        candidate, known = vector.load(curve, k), vector.load(right.cost, start + k)
+        index, best = vector.load(right.indices, k), vector.load(right.best, start + k)
+        vector.store(right.best, start + k, vector.choose_smaller(candidate, known, index, best))
+        vector.store(right.cost, start + k, vector.smaller(candidate, known))
 
 
 @part
 def search_flags(costs, r, c, span, possible):
     """Validity flags of a pixel without all candidates; the left and the right image set separate flags."""
-    flags = 0
-    if costs.left_state[r, c] != 0:
-        flags |= LEFT_WINDOW
+    flags = LEFT_WINDOW if costs.left_state[r, c] != 0 else 0
     usable, masked = 0, False
     for x in range(c + span.first, c + span.last + 1):
         usable += costs.right_state[r, x] == 0
@@ -165,7 +138,7 @@ def read_curve(curve, span, lowest, settings):
 
     Bounds are steps above the first disparity of the whole search range; NO_BOUND if they are off.
     """
-    k = _winner(curve, span, lowest)
+    k = first_at_most(curve, span, lowest)
     shift, refined = vfit(curve, k, settings.count) if settings.refine else (0.0, False)
     high = low = NO_BOUND, NO_BOUND
     if settings.steps > 1:  # a test of the level, a float, makes the whole sweep 30 % slower

@@ -1,6 +1,6 @@
 """Sub-pixel refinement by least squares on grey values, and local planes (METHOD.md, section 19).
 
-Letters: r row, c column, i row of a window, j its column; b left value, v right value, g its derivative along the row,
+Letters: i row of a window, j its column; b left value, v right value, g its derivative along the row,
 x disparity, w weight; two letters are a product's sum over a window. A row is worked on in pieces of _PIECE columns,
 line by line of their windows, so that the loops over columns vectorise.
 """

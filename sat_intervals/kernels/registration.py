@@ -223,26 +223,19 @@ def _median(values: np.ndarray) -> float:
     return float(np.median(known)) if known.size else np.nan
 
 
-def _mean_of_blocks(blocks: Blocks, values: np.ndarray) -> tuple[float, float]:
-    """Return the mean over points and its standard error, from what differs between blocks; NaN without points."""
-    known = np.isfinite(values)
-    if not known.any():
-        return np.nan, np.inf
-    sums, counts = (np.bincount(blocks.block[known], weights, len(blocks.surface)) for weights in (values[known], None))
-    sums, counts = sums[counts > 0], counts[counts > 0]
-    mean = float(sums.sum() / counts.sum())
-    if len(counts) < 2:
-        return mean, np.inf
-    spread = ((sums - mean * counts) ** 2).sum() * len(counts) / (len(counts) - 1)
-    return mean, float(np.sqrt(spread)) / float(counts.sum())
-
-
 def _vertical(blocks: Blocks, differences: np.ndarray) -> tuple[float, float]:
-    """Return the median difference, and its standard deviation."""
+    """Return the median difference, and its standard deviation by what differs between blocks; infinite for one."""
     up = _median(differences)
     scale = max(_NORMAL * _median(np.abs(differences - up)), 1e-6)
-    _, error = _mean_of_blocks(blocks, np.clip(differences - up, -1.5 * scale, 1.5 * scale))
-    return up, 1.2 * error
+    known = np.isfinite(differences)
+    values = np.clip(differences[known] - up, -1.5 * scale, 1.5 * scale)
+    sums, counts = (np.bincount(blocks.block[known], weights, len(blocks.surface)) for weights in (values, None))
+    sums, counts = sums[counts > 0], counts[counts > 0]
+    if len(counts) < 2:
+        return up, np.inf
+    mean = float(sums.sum() / counts.sum())
+    spread = ((sums - mean * counts) ** 2).sum() * len(counts) / (len(counts) - 1)
+    return up, 1.2 * (float(np.sqrt(spread)) / float(counts.sum()))
 
 
 def summary(differences: np.ndarray) -> dict[str, float]:

@@ -10,8 +10,6 @@ import numpy as np
 from sat_intervals.kernels.compiled import cached, inlined
 from sat_intervals.kernels.row_offsets import AFTER, BEFORE, cubic_weights
 
-ONE, TWO, THREE = np.uint64(1), np.uint64(2), np.uint64(3)
-
 
 def reach(scale: float) -> tuple[int, int]:
     """Return the pixels that the result needs around a position, before and after it; see `resample_reduced`."""
@@ -71,9 +69,9 @@ def resample(pixels, origin, nodes, step, first, rows, columns):
                 around = pixels[above + np.uint64(a)]
                 value += down[a] * (
                     across[0] * around[before]
-                    + across[1] * around[before + ONE]
-                    + across[2] * around[before + TWO]
-                    + across[3] * around[before + THREE]
+                    + across[1] * around[before + np.uint64(1)]
+                    + across[2] * around[before + np.uint64(2)]
+                    + across[3] * around[before + np.uint64(3)]
                 )
             result[r, c] = value
     return result

@@ -1,6 +1,6 @@
 """Row offsets between two images: a polynomial of the place, resampling along columns, and least-squares shifts.
 
-Letters: r row, c column; v, u row and column from the middle of the image, in halves of its longer side; t part of a
+Letters: v, u row and column from the middle of the image, in halves of its longer side; t part of a
 pixel. Between pixels values are cubic (Keys 1981, a = -1/2).
 """
 

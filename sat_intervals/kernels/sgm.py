@@ -4,9 +4,7 @@
 
 where q is the pixel before p on the path. P1 and P2 are constant, or depend on candidate and path. A sweep down the
 rows, columns ascending, advances the four paths from the left, the upper left, above and the upper right. A sweep up,
-columns descending, advances the other four.
-
-Letters: r row, c column, k disparity index (disparity d = minimum + k), in blocks of 32 lanes.
+columns descending, advances the other four. Candidates k are in blocks of 32 lanes.
 """
 
 from typing import NamedTuple
@@ -108,12 +106,10 @@ def advance_pixel(candidates, span, penalties, paths, slots, r, c, target):
     curves, lowest, spans = paths
     array, offset = target
     p1, p2, row = penalties
-    path_1, path_2, path_3, path_4 = (
-        _begin(paths, slots[0], span.start),
-        _begin(paths, slots[1], span.start),
-        _begin(paths, slots[2], span.start),
-        _begin(paths, slots[3], span.start),
-    )
+    path_1 = _begin(paths, slots[0], span.start)
+    path_2 = _begin(paths, slots[1], span.start)
+    path_3 = _begin(paths, slots[2], span.start)
+    path_4 = _begin(paths, slots[3], span.start)
     for k in range(span.start, span.stop, LANES):
         costs = candidate_costs(candidates, r, c, k)
         path_1, cost_1 = _advance(path_1, curves, k, costs, penalties_of(p1, p2, row, 0, c, k))
@@ -202,10 +198,7 @@ def enter_row(paths, columns, falling, rising, down):
     The slot of a diagonal that enters holds the path that left the patch at the other end of the previous row.
     """
     first, last = path_slots(0, columns, falling, rising), path_slots(columns - 1, columns, falling, rising)
-    if down:
-        restart(paths, (0, first[1], last[2]))
-    else:
-        restart(paths, (0, last[1], first[2]))
+    restart(paths, (0, first[1], last[2]) if down else (0, last[1], first[2]))
 
 
 # The sweep of each wavefront, True for down, and its wave of that sweep. A wave is two paths: 0, along the row and the
@@ -236,12 +229,6 @@ class Borders(NamedTuple):
 
     inside: Window
     around: tuple[Edge, ...]
-
-
-def no_borders(inside: Window, size: int) -> Borders:
-    """Borders of a patch without neighbours; ``size`` is a number of whole vectors."""
-    nothing = np.zeros((0, 2, size), np.uint16)
-    return Borders(inside, (Edge(nothing, nothing),) * len(WAVEFRONTS))
 
 
 @part

@@ -3,14 +3,13 @@
 The sweep down stores the sum of its four paths. The sweep up adds its own four, and reads winner, refinement, interval,
 ambiguity and the right view's winner from the finished curve while it is in the cache. No other volume is stored, and
 each sweep ends at the last row of the wanted pixels.
-
-Letters: r row, c column, k disparity index (disparity = minimum + k).
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
+from sat_intervals.kernels import reading, sgm
 from sat_intervals.kernels.compiled import cached, part
 from sat_intervals.kernels.cost import (
     Candidates,
@@ -24,35 +23,8 @@ from sat_intervals.kernels.cost import (
     span_at,
 )
 from sat_intervals.kernels.penalties import Gradients, Penalties, fill_row, make_penalties
-from sat_intervals.kernels.reading import (
-    Rectangle,
-    close_impossible,
-    columns_of,
-    contains,
-    open_curve,
-    read_curve,
-    rectangle_of,
-    search_flags,
-    update_right,
-)
-from sat_intervals.kernels.sgm import (
-    LAST_WAVE,
-    WALL,
-    Borders,
-    Edge,
-    Paths,
-    add_curve,
-    advance_pixel,
-    advance_wave,
-    enter_row,
-    hand_on,
-    keep_curve,
-    new_paths,
-    no_borders,
-    path_slots,
-    restart,
-    take_over,
-)
+from sat_intervals.kernels.reading import Rectangle, columns_of, contains, rectangle_of
+from sat_intervals.kernels.sgm import LAST_WAVE, WALL, Borders, Edge, Paths
 from sat_intervals.products import IMPOSSIBLE_COST, NOT_REFINED
 from sat_intervals.tiling import Window
 
@@ -140,7 +112,8 @@ def new_buffers(
     """Allocate the buffers of a sweep; parameters as in `match_costs`."""
     (rows, columns), size = costs.left_state.shape, padded_to_lanes(settings.count)
     left = borders.inside if borders else Window(0, 0, 0, 0)
-    inside, around = borders or no_borders(Window(0, 0, rows, columns), size)
+    nothing = np.zeros((0, 2, size), np.uint16)
+    inside, around = borders or (Window(0, 0, rows, columns), (Edge(nothing, nothing),) * len(sgm.WAVEFRONTS))
     has_cells = cells is not None
     k = np.arange(size)
     cells = cells or Cells(np.zeros((1, 1), np.int64), np.full((1, 1), settings.count - 1), rows, columns, 0, 0)
@@ -152,7 +125,7 @@ def new_buffers(
         np.zeros(columns + settings.count, np.int64),
         np.zeros(columns, np.int64),
         make_penalties(gradients, settings.p1, settings.p2, columns, size),
-        new_paths(columns, size, has_cells),
+        sgm.new_paths(columns, size, has_cells),
         np.zeros(size, np.uint16),
         np.array([0, size]) if has_cells else None,
         rectangle_of(inside),
@@ -179,8 +152,8 @@ def _enter_row(buffers, gradients, settings, r):
         inner = usable[c + span.last + 1] - usable[c + span.first]
         possible[c] = possible_count(costs.possible, r, c, inner if costs.left_state[r, c] == 0 else 0)
     falling, rising = -r % possible.size, r % possible.size
-    enter_row(paths, possible.size, falling, rising, down)
-    take_over(paths, around, inside, r, falling, rising, down)
+    sgm.enter_row(paths, possible.size, falling, rising, down)
+    sgm.take_over(paths, around, inside, r, falling, rising, down)
     fill_row(gradients, r, down, penalties.row)
     return falling, rising
 
@@ -194,14 +167,14 @@ def trace_wave(buffers, gradients, settings, wave):
         r = step if down else rows - 1 - step
         falling, rising = _enter_row(buffers, gradients, settings, r)
         for c in columns_of(inside, r, down):
-            slots = path_slots(c, possible.size, falling, rising)
+            slots = sgm.path_slots(c, possible.size, falling, rising)
             if possible[c] == 0:
-                restart(paths, (slots[2 * wave], slots[2 * wave + 1]))
+                sgm.restart(paths, (slots[2 * wave], slots[2 * wave + 1]))
             else:
                 span = span_at(ranges, settings.count, curve.size, c)
-                advance_wave(candidates, span, penalties, paths, slots, wave, r, c)
+                sgm.advance_wave(candidates, span, penalties, paths, slots, wave, r, c)
         if inside.row <= r < inside.row_stop:
-            hand_on(paths, inside, r, falling, rising, wave, down, leaving)
+            sgm.hand_on(paths, inside, r, falling, rising, wave, down, leaving)
 
 
 @part
@@ -223,13 +196,13 @@ def sweep_down(buffers, gradients, settings, output, volume):
         if r >= output.row:
             _enter_output(volume, ranges, curve.size, output, r)
         for c in columns_of(inside, r, True):
-            slots = path_slots(c, possible.size, falling, rising)
+            slots = sgm.path_slots(c, possible.size, falling, rising)
             span = span_at(ranges, settings.count, curve.size, c)
             if possible[c] == 0:
-                restart(paths, slots)
+                sgm.restart(paths, slots)
                 continue
             target = (volume.sums, volume.places[c]) if contains(output, r, c) else (curve, 0)
-            advance_pixel(candidates, span, penalties, paths, slots, r, c, target)
+            sgm.advance_pixel(candidates, span, penalties, paths, slots, r, c, target)
 
 
 @cached
@@ -243,36 +216,36 @@ def sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
         if r < output.row_stop:
             _enter_output(volume, ranges, curve.size, output, r)
         for c in columns_of(inside, r, False):
-            slots = path_slots(c, possible.size, falling, rising)
+            slots = sgm.path_slots(c, possible.size, falling, rising)
             span = span_at(ranges, settings.count, curve.size, c)
-            open_curve(curve, opened, span)
+            reading.open_curve(curve, opened, span)
             if possible[c] == 0:
-                restart(paths, slots)
+                sgm.restart(paths, slots)
             elif settings.regularized:
-                advance_pixel(candidates, span, penalties, paths, slots, r, c, (curve, 0))
+                sgm.advance_pixel(candidates, span, penalties, paths, slots, r, c, (curve, 0))
             if not contains(output, r, c):
                 continue
             i, j, place = r - output.row, c - output.column, volume.places[c]
             if possible[c] < span.last + 1 - span.first:
-                validity[i, j] = search_flags(costs, r, c, span, possible[c])
+                validity[i, j] = reading.search_flags(costs, r, c, span, possible[c])
             if possible[c] == 0:
                 if keep:
                     volume.sums[place + span.start : place + span.stop] = IMPOSSIBLE_COST
                 continue
             if settings.regularized:
-                add_curve(curve, span, volume.sums, place)
+                sgm.add_curve(curve, span, volume.sums, place)
             else:
                 cost_curve(candidates, span, r, c, curve)
-            lowest = close_impossible(curve, candidates, span, r, c, settings.impossible)
-            winner[i, j], shift, refined, high, low, ambiguity[i, j] = read_curve(curve, span, lowest, settings)
+            lowest = reading.close_impossible(curve, candidates, span, r, c, settings.impossible)
+            winner[i, j], shift, refined, high, low, ambiguity[i, j] = reading.read_curve(curve, span, lowest, settings)
             lower[i, j], upper[i, j] = high
             lower_low[i, j], upper_low[i, j] = low
             disparity[i, j], cost[i, j] = winner[i, j] + shift, lowest
             if not refined:
                 validity[i, j] |= NOT_REFINED
             if contains(right.core, r, c):
-                update_right(curve, span, right, r, c)
+                reading.update_right(curve, span, right, r, c)
             if keep:
-                keep_curve(curve, span, volume.sums, place)
+                sgm.keep_curve(curve, span, volume.sums, place)
         if leaving.row.shape[0] and inside.row <= r < inside.row_stop:
-            hand_on(paths, inside, r, falling, rising, LAST_WAVE, False, leaving)
+            sgm.hand_on(paths, inside, r, falling, rising, LAST_WAVE, False, leaving)

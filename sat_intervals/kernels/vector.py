@@ -47,10 +47,7 @@ def _primitive(result, *parameters):
 
     def intrinsic_of(build):
         def typed(typing_context, *arguments):
-            def generate(context, builder, signature, values):
-                return build(builder, *values)
-
-            return result(*parameters), generate
+            return result(*parameters), lambda context, builder, signature, values: build(builder, *values)
 
         return intrinsic(update_wrapper(typed, build))  # numba counts the parameters of `build`
 
@@ -110,10 +107,10 @@ def load_costs(typing_context, array, index):
     """Return ``array.ravel()[index : index + 32]`` of a uint8 or uint16 array, as uint16 lanes."""
 
     def generate(context, builder, signature, arguments):
-        data, kind = context.make_array(array)(context, builder, arguments[0]).data, _VECTOR
+        data = context.make_array(array)(context, builder, arguments[0]).data
         if array.dtype == types.uint8:
-            return builder.zext(builder.load(_vector_at(builder, data, arguments[1], _BYTES), align=1), kind)
-        return builder.load(_vector_at(builder, data, arguments[1], kind), align=2)
+            return builder.zext(builder.load(_vector_at(builder, data, arguments[1], _BYTES), align=1), _VECTOR)
+        return builder.load(_vector_at(builder, data, arguments[1], _VECTOR), align=2)
 
     return vector_type(array, types.intp), generate
 

@@ -2,18 +2,12 @@
 
 import numpy as np
 import pytest
+import reference
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from sat_intervals.kernels.row_offsets import AFTER, BEFORE, RowOffsets, shift_equations, shift_rows
-
-
-def cubic(t):
-    """Keys' kernel with a = -1/2."""
-    t = abs(t)
-    inner, outer = (1.5 * t - 2.5) * t * t + 1, ((-0.5 * t + 2.5) * t - 4) * t + 2
-    return np.where(t <= 1, inner, np.where(t < 2, outer, 0))
 
 
 @settings(max_examples=40)
@@ -28,7 +22,7 @@ def test_shift_rows__equals_its_slow_twin(seed, rows, columns):
     for r, c in np.ndindex(rows, columns):
         place = r + offset[r, c]
         near = np.arange(len(pixels))
-        weights = cubic(place - near)
+        weights = reference.cubic(place - near)
         wanted = np.bitwise_or.reduce(state[np.abs(weights) > 1e-12, c])
         assert states[r, c] == wanted
         assert_allclose(found[r, c], 0 if wanted else weights @ pixels[:, c], atol=1e-12)
