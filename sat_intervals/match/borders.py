@@ -44,10 +44,7 @@ def in_order(wavefront: int, tiles: Iterable[Tile]) -> list[Tile]:
 
 
 def _around(wavefront: int, patch: Window, borders: Mapping[Place, Border], size: int) -> Edge:
-    """The states around a patch, from the borders of the tile's `sources` that exist.
-
-    ``size`` is the number of disparities in whole vectors.
-    """
+    """The states around a patch, from the borders of the tile's `sources` that exist; ``size`` is in whole vectors."""
     beside, *before = sources(wavefront)
     nothing = np.zeros((0, 2, size), np.uint16)
     row = nothing
@@ -92,10 +89,7 @@ def trace_area(
     config: Config,
     ranges: LocalRanges | None = None,
 ) -> Edge:
-    """Path states that a tile hands on in a wavefront, an index of WAVEFRONTS.
-
-    ``cost`` is that of the `frame_area`, ``borders`` are the states that the tile takes over, see `borders_of`.
-    """
+    """Path states that a tile hands on in a wavefront, from the costs of its `frame_area` and its `borders_of`."""
     settings, cells = patch_settings(frame_area(frame, config).base, config, ranges)
     settings = mirrored_settings(settings) if frame.mirrored else settings
     return trace(cost.costs, settings, borders, wavefront, cost.gradients, cells)

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from sat_intervals.kernels.cost import Codes, between, census
-from sat_intervals.match.matching_cost import Area, AreaCosts, PairCost, of_area
+from sat_intervals.match.matching_cost import Area, AreaCosts, MatchingCost, of_area
 from sat_intervals.tiling import Views
 
 
-class CensusCost(PairCost):
+class CensusCost(MatchingCost):
     """Hamming distances of Census codes."""
 
     def of_areas(

@@ -123,8 +123,7 @@ class Found:
 def with_range(config: Config, found: Found) -> Config:
     """The settings with a range that was found."""
     ends = {"minimum": found.minimum, "maximum": found.maximum, "open_ends": True}
-    disparity = config.disparity.model_copy(update=ends)
-    return config.model_copy(update={"disparity": disparity})
+    return config.model_copy(update={"disparity": config.disparity.model_copy(update=ends)})
 
 
 class Matches(NamedTuple):
@@ -188,10 +187,7 @@ def _coarser(image: np.ndarray, step: Step) -> np.ndarray:
 
 
 def undeclared_border(image: np.ndarray, smallest: float) -> np.ndarray:
-    """Pixels of a level that have only the smallest value and reach the border of the image along a row or column.
-
-    ``image`` is float32; ``smallest`` is the smallest usable value. Returns bool of the same shape.
-    """
+    """Pixels of a level that have only the smallest usable value and reach the border along a row or column: bool."""
     has = np.isclose(image, smallest, rtol=1e-6, atol=0) if np.isfinite(smallest) else np.zeros(image.shape, bool)
     found = np.zeros(image.shape, bool)
     for axis in (0, 1):
@@ -243,8 +239,7 @@ def find_range(left: np.ndarray, right: np.ndarray, step: Step, shape: tuple[int
 def _local(matches: Matches, minimum: int, maximum: int, shape: tuple[int, int]) -> LocalRanges:
     """Local ranges from the matches of a level: those of a cell and its neighbours, with a margin.
 
-    Cells without enough matches get the whole range: there is too little evidence for a narrower one. Cells without a
-    usable pixel take the range of their neighbours.
+    Cells without enough matches get the whole range, cells without a usable pixel the range of their neighbours.
     """
     rows, columns = (-(-side // (_CELL * size)) for side, size in zip(shape, matches.step, strict=True))
 
@@ -302,10 +297,9 @@ def _matches_of(left: np.ndarray, right: np.ndarray, search: np.ndarray | None, 
 
 
 def match_level(left: np.ndarray, right: np.ndarray, searched: tuple[int, int], speckle: int) -> Matches:
-    """Match a level strip by strip; remove stray matches.
+    """Match a level over the disparities ``searched`` strip by strip; remove surfaces of less than ``speckle`` pixels.
 
-    ``left`` and ``right`` are float32, NaN where not usable; ``searched`` the first and the last disparity in pixels of
-    the level; ``speckle`` the pixels that a surface has at least.
+    ``left`` and ``right`` are float32, NaN where not usable.
     """
     first, last = searched
     usable = np.count_nonzero(np.isfinite(left))

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from decimal import Decimal
-from typing import NamedTuple
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from sat_intervals.match.postprocess import (
     ConfidenceScale,
     Filtered,
     RawRows,
+    cut_rows,
     filter_rows,
     regularized,
     widened,
@@ -47,37 +47,13 @@ def block_numbers(row: int, height: int, shape: tuple[int, int]) -> np.ndarray:
     return np.asarray(_BLOCKS * rows[row : row + height, None] + columns)
 
 
-class _Piece(NamedTuple):
-    """Rows with their halo, the range of those that are measured, and their truths and parts."""
-
-    rows: Filtered
-    first: int
-    last: int
-    truth: np.ndarray
-    parts: np.ndarray
-
-    @property
-    def inner(self) -> slice:
-        """Return the rows that are measured."""
-        return slice(self.first, self.last)
-
-    def of(self, name: str) -> np.ndarray:
-        """Return a band of the rows that are measured."""
-        return np.asarray(getattr(self.rows, name)[self.inner])
-
-    @property
-    def kept(self) -> np.ndarray:
-        """Return the mask of valid pixels."""
-        return np.asarray(self.of("validity") & INVALID == 0)
-
-
 class Gauge:
     """Measures the intervals of a pair, as a whole, of a group, or in blocks, that of `block_numbers`."""
 
     def __init__(self, thresholds: ThresholdSweep, group: str, tolerance: float, *, in_blocks: bool) -> None:
         parts = _BLOCKS**2 if in_blocks else 1
         self._names = [f"block {part}" for part in range(parts)] if in_blocks else [group]
-        self._rungs, self._tolerance = thresholds, tolerance
+        self._thresholds, self._tolerance = thresholds, tolerance
         self._tables = np.zeros((parts, thresholds.low.size, SCHEMES, FIELDS))
 
     def measured(self) -> list[Measured]:
@@ -99,37 +75,28 @@ class Gauge:
 
         ``truth``: of these rows, and the number of the part of each pixel.
         """
-        for threshold, names in zip(
-            dict.fromkeys(pair), (("lower", "upper"), ("lower_low", "upper_low")), strict=False
-        ):
-            lower, upper = (getattr(strip, name) for name in names)
-            rows = filter_rows(
-                strip._replace(lower=lower, upper=upper, lower_low=lower, upper_low=upper), scale, config
-            )
-            piece = _Piece(rows, inner.start, inner.stop, *truth)
-            for number, scheme, bounds in self._bounds(piece, threshold, config):
-                self._tables[:, number, scheme] += self._measured(piece, scheme, bounds, config)
+        cuts = (strip.lower, strip.upper), (strip.lower_low, strip.upper_low)
+        for threshold, (lower, upper) in zip(dict.fromkeys(pair), cuts, strict=False):
+            one_cut = strip._replace(lower=lower, upper=upper, lower_low=lower, upper_low=upper)
+            rows = filter_rows(one_cut, scale, config)
+            here = cut_rows(rows, inner.start, inner.stop)
+            valid = (here.validity & INVALID == 0) & np.isfinite(truth[0])
+            for number, scheme, bounds in self._bounds(rows, inner, threshold, config):
+                chosen = np.flatnonzero(valid & (here.low == (scheme != HIGH)))
+                middle, low, high, true, part = (band.ravel()[chosen] for band in (here.disparity, *bounds, *truth))
+                low, high = widened(low, high, middle, config)
+                measured = measure(low, high, true, self._tolerance, part, len(self._tables))
+                self._tables[:, number, scheme] += measured
 
     def _bounds(
-        self, piece: _Piece, threshold: int, config: Config
+        self, rows: Filtered, inner: slice, threshold: int, config: Config
     ) -> Iterator[tuple[int, int, tuple[np.ndarray, np.ndarray]]]:
-        """Yield the thresholds and schemes that a piece is measured for, and their bounds."""
+        """Yield the thresholds and schemes that the rows ``inner`` are measured for, and their bounds."""
         if threshold == OF_FITS:
-            fits, lower, upper = piece.rows.fits(piece.inner), piece.of("lower"), piece.of("upper")
-            for number, factor in enumerate(self._rungs.high):
+            fits, lower, upper = rows.fits(inner), rows.lower[inner], rows.upper[inner]
+            for number, factor in enumerate(self._thresholds.high):
                 yield number, HIGH, bounds_of_both(fits, lower, upper, factor, config)
             return
         for scheme, quantile in enumerate((None, *QUANTILES)):
-            if scheme != HIGH or self._rungs.are_one:
-                yield threshold, scheme, regularized(piece.rows, piece.first, piece.last, config, quantile)
-
-    def _measured(
-        self, piece: _Piece, scheme: int, bounds: tuple[np.ndarray, np.ndarray], config: Config
-    ) -> np.ndarray:
-        """Measure the bounds of the kept pixels of a scheme's class."""
-        chosen = np.flatnonzero(piece.kept & np.isfinite(piece.truth) & (piece.of("low") == (scheme != HIGH)))
-        middle, lower, upper, true, part = (
-            band.ravel()[chosen] for band in (piece.of("disparity"), *bounds, piece.truth, piece.parts)
-        )
-        lower, upper = widened(lower, upper, middle, config)
-        return measure(lower, upper, true, self._tolerance, part, len(self._tables))
+            if scheme != HIGH or self._thresholds.are_one:
+                yield threshold, scheme, regularized(rows, inner.start, inner.stop, config, quantile)

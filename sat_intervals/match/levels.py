@@ -1,8 +1,4 @@
-"""Choose the levels of a calibration from intervals that were measured at a sweep of thresholds (docs/coverage.md).
-
-Coverages are known at the thresholds of the sweep, and interpolated between them. See `measurement` for the letters of
-shapes.
-"""
+"""Choose the levels of a calibration from intervals measured at a sweep of thresholds, see `measurement`."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
@@ -52,10 +48,7 @@ def pooled(parts: Iterable[Measured]) -> Pool:
 def calibration_of_parts(
     parts: Sequence[Measured], config: Config, name: str, pairs: list[dict[str, Any]], key: dict[str, Any]
 ) -> tuple[Calibration, list[dict[str, float]]]:
-    """Return the calibration of measured parts, and what to expect of it: a row for each coverage.
-
-    ``pairs`` are for the provenance; ``key`` names the settings, see `key_of`.
-    """
+    """Return the calibration of measured parts with ``pairs`` as provenance, and what to expect of it by coverage."""
     thresholds, pool, expected, notes = threshold_sweep(config), pooled(parts), [], []
     chosen: list[Levels] = []
     for coverage, groups in zip(COVERAGES, left_out(parts, thresholds, COVERAGES), strict=True):
@@ -153,8 +146,7 @@ def _level(fields: np.ndarray, levels: np.ndarray, coverage: float) -> float | N
 def at_level(fields: np.ndarray, levels: np.ndarray, level: float) -> np.ndarray:
     """Measurement at a level: ``(thresholds, fields)`` to ``(fields,)``.
 
-    Between thresholds, misses fall geometrically, since they fall nearly exponentially with the level; the
-    rest is linear.
+    Between thresholds, misses fall geometrically, since they fall nearly exponentially with the level.
     """
     above = int(np.clip(np.searchsorted(levels, level), 1, levels.size - 1))
     share = (level - levels[above - 1]) / (levels[above] - levels[above - 1])
@@ -175,10 +167,7 @@ def interval_score(fields: np.ndarray, coverage: float) -> float:
 
 
 def expected(table: np.ndarray, sweep: ThresholdSweep, levels: Levels) -> dict[str, float]:
-    """Figures with given levels: coverage of all, high and low, widths in pixels, interval score; NaN without pixels.
-
-    ``table`` is that of a `Pool`.
-    """
+    """Coverage of all, high and low, widths in pixels and interval score with given levels; NaN without pixels."""
     assert levels.coverage is not None
     high = at_level(table[:, HIGH], sweep.high, levels.high)
     low = at_level(table[:, HIGH + 1 + QUANTILES.index(levels.quantile)], sweep.low, levels.low)
@@ -202,10 +191,7 @@ def _share(fields: np.ndarray, which: int) -> float:
 def left_out(
     parts: Sequence[Measured], sweep: ThresholdSweep, coverages: Iterable[float]
 ) -> list[dict[str, dict[str, float]]]:
-    """For each coverage, figures of each group, see `expected`, with the levels chosen on the others.
-
-    Empty for a single group.
-    """
+    """For each coverage, the `expected` figures of each group, levels chosen on the others; none for one group."""
     groups = list(dict.fromkeys(part.group for part in parts))
     own = {group: pooled(part for part in parts if part.group == group).table for group in groups}
     rest = {group: pooled(part for part in parts if part.group != group) for group in groups if len(groups) > 1}

@@ -1,12 +1,8 @@
-"""A matching cost, as the engine knows it: what it reads, and the costs of areas (docs/development.md).
-
-`costs` has the matching costs that there are. The numbers of a cost, its files and its memory are in its section of the
-settings, see `config.costs`.
-"""
+"""A matching cost: what it reads, and the costs of areas; `config.costs` has its numbers, files and memory."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import reduce
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -83,39 +79,25 @@ class Given(NamedTuple):
     volume_of: VolumeOf | None = None
 
 
-class MatchingCost(Protocol):
+class MatchingCost:
     """A matching cost with all that it needs."""
+
+    def __init__(self, config: Config, given: Given) -> None:
+        self._config, self._given = config, given
 
     @staticmethod
     def check(config: Config) -> None:
         """Raise if the costs of these settings cannot be computed on this machine."""
 
-    def __init__(self, config: Config, given: Given) -> None:
-        """Make a cost of settings and what a run knows beside them."""
-
-    def windows(self, areas: Sequence[Area]) -> tuple[Window, ...]:
+    def windows(self, areas: Sequence[Area]) -> tuple[Window, Window]:
         """Return the window of each image that the costs of areas need; the areas are in the same rows."""
+        return view_windows(areas, self._config)
 
     def of_areas(
         self, views: Views, areas: Sequence[Area], made: Sequence[np.ndarray] | None = None
     ) -> list[AreaCosts]:
-        """Compute the costs of areas.
-
-        views: the images in the `windows` of the areas.
-        made: precomputed costs from an earlier call, ``Costs.left``, so that they are not computed again.
-        """
-
-
-class PairCost(MatchingCost):
-    """What matching costs from the pixels of two views have in common."""
-
-    def __init__(self, config: Config, given: Given) -> None:
-        """Keep what all of them need."""
-        self._config, self._given = config, given
-
-    def windows(self, areas: Sequence[Area]) -> tuple[Window, ...]:
-        """Return the windows of both images."""
-        return view_windows(areas, self._config)
+        """Compute the costs of areas; ``made`` are precomputed ones of an earlier call, ``Costs.left``."""
+        raise NotImplementedError
 
     def _with_views(self, costs: Costs, area: Area, views: Views) -> AreaCosts:
         """Return costs of an area with what the kernels need of the pixels."""
@@ -132,10 +114,7 @@ def view_windows(areas: Sequence[Area], config: Config) -> tuple[Window, Window]
 
 
 def of_area(area: Area, views: Views, arrays: Sequence[np.ndarray], radius: int) -> tuple[np.ndarray, np.ndarray]:
-    """Crop the arrays of both views to an area: columns of its base, and of the pixels that face it.
-
-    ``arrays``, ``(..., columns)``, belong to the left and the right view without a margin of ``radius``.
-    """
+    """Crop arrays of both views, ``(..., columns)`` without a margin ``radius``, to the base and facing of an area."""
 
     def crop(side: bool, wanted: Window) -> np.ndarray:
         first = wanted.column - views[side].window.column - radius
@@ -157,7 +136,6 @@ def textureless(cost: AreaCosts, area: Area, config: Config, cells: Cells | None
     """Pixels of the base whose window, and all usable windows that face it, do not vary along any row.
 
     All their candidates cost the same. SGM would still choose among them, by costs carried in from the image borders.
-    ``cells`` are the local search ranges of the area; by default all pixels search all of it.
     """
     costs, views, radius = cost.costs, cost.views, config.cost.window // 2
     if views is None:

@@ -18,7 +18,7 @@ from sat_intervals.config.weights import INSTALL_MCCNN
 from sat_intervals.errors import ChangedInputError, SatIntervalsError
 from sat_intervals.kernels.correlation import correlate
 from sat_intervals.kernels.cost import Costs, padded_to_lanes, window_state
-from sat_intervals.match.matching_cost import Area, AreaCosts, Given, PairCost, of_area
+from sat_intervals.match.matching_cost import Area, AreaCosts, Given, MatchingCost, of_area
 from sat_intervals.match.normalization import ImageStatistics
 from sat_intervals.tiling import View, Views
 
@@ -36,7 +36,6 @@ class Network:
     """A network that was checked to have the form above. Any number of threads may call it at once."""
 
     def __init__(self, file: Path, content: bytes) -> None:
-        """Make a network of the content of a file, and check it; ``file`` is for messages."""
         self._session = _session(file, content)
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         form = f"{[i.shape for i in inputs]} to {[o.shape for o in outputs]}"
@@ -60,8 +59,7 @@ class Network:
     def __call__(self, pixels: np.ndarray) -> np.ndarray:
         """Features ``(count, rows - 10, columns - 10)`` of normalised pixels ``(rows, columns)``, float32.
 
-        A feature of NaN becomes zeros, whose cosine with any feature is 0. A network without biases gives NaN for a
-        window without texture: it divides by a length of 0.
+        A feature of NaN, that of a window without texture, becomes zeros, whose cosine with any feature is 0.
         """
         features = np.asarray(self._session.run(None, {self._input: pixels})[0])
         undefined = np.isnan(features[:1]).all(axis=0)
@@ -123,11 +121,10 @@ def _loaded(weights: _Weights) -> Network:
     return Network(weights.file, weights.content)
 
 
-class MccnnCost(PairCost):
+class MccnnCost(MatchingCost):
     """1 - cosine of the features of both views."""
 
     def __init__(self, config: Config, given: Given) -> None:
-        """Load the network; raise if it is not that of the run."""
         super().__init__(config, given)
         weights = _Weights.of(config.cost.files()["weights"])
         if given.inputs is not None and weights.sha256 != given.inputs.get("weights", {}).get("sha256"):

@@ -10,7 +10,7 @@ import numpy as np
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.row_offsets import RowOffsets
 from sat_intervals.match.coarse import Found, NoRangeError
-from sat_intervals.match.sampling import BlockMatch, noise_of
+from sat_intervals.match.sampling import BlockMatch
 from sat_intervals.products import plain
 from sat_intervals.tiling import Window
 
@@ -100,13 +100,6 @@ class Survey:
     search: tuple[int, int]
     noise: float | None
     rows: RowFit | None
-
-    @classmethod
-    def of_matches(
-        cls, region: Window, search: tuple[int, int], samples: Sequence[BlockMatch], shape: tuple[int, int]
-    ) -> "Survey":
-        """Return what samples tell of a pair whose right image has so many rows and columns; see `fit_rows`."""
-        return cls(region, search, noise_of(samples), fit_rows(samples, *shape))
 
     @property
     def is_large(self) -> bool:

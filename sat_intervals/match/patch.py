@@ -35,7 +35,7 @@ class PatchFrame(NamedTuple):
 
     @classmethod
     def of_whole(cls, whole: Window) -> Self:
-        """PatchFrame of an image that is matched as one core."""
+        """Frame of an image that is matched as one core."""
         return cls(whole, whole, whole)
 
 
@@ -101,7 +101,7 @@ def frames_of(left: PatchFrame, config: Config) -> list[PatchFrame]:
 
 
 def mirrored_frame(frame: PatchFrame, config: Config) -> PatchFrame:
-    """PatchFrame of the right view: the pixels that face a left core at the smallest disparity.
+    """Frame of the right view: the pixels that face a left core at the smallest disparity.
 
     The last core of a row also has the others that face it, so that each right pixel belongs to one core.
     """
@@ -141,17 +141,11 @@ def patch_areas(frame: PatchFrame, config: Config, ranges: LocalRanges | None = 
         return [frame_area(view, config, ranges) for view in frames_of(frame, config)]
     base = frame.core.grown(overlap, overlap).clipped(frame.whole)
     areas = [Area.of(base, narrowed(ranges, base, config))]
-    if config.matches_right_view:
-        areas.append(_right_area(frame, overlap, config))
+    if config.matches_right_view:  # its pixels may be outside the right image
+        reach = facing(frame.core, config.disparity.minimum, config.disparity.maximum).grown(overlap, overlap)
+        rows = Window(frame.whole.row, reach.column, frame.whole.height, reach.width)
+        areas.append(Area.of(reach.clipped(rows), config, mirrored=True))
     return areas
-
-
-def _right_area(frame: PatchFrame, overlap: int, config: Config) -> Area:
-    """Area of the right pixels that face a core, with their overlap; they may be outside the right image."""
-    search, whole = config.disparity, frame.whole
-    reach = facing(frame.core, search.minimum, search.maximum)
-    rows = Window(whole.row, reach.column - overlap, whole.height, reach.width + 2 * overlap)
-    return Area.of(reach.grown(overlap, overlap).clipped(rows), config, mirrored=True)
 
 
 def match_patch(
@@ -161,10 +155,7 @@ def match_patch(
     borders: Sequence[Borders] | None = None,
     ranges: LocalRanges | None = None,
 ) -> Patch:
-    """Match a core from the costs of its `patch_areas`; ``frame`` is that of the left view.
-
-    ``borders`` are path states of the neighbours for each area; by default every path starts where its area does.
-    """
+    """Match a core of the left view from the costs of its `patch_areas`, and path states of the neighbours for each."""
     is_exact, core = config.tiles.overlap == "exact", frame.core
     output = core if is_exact else core.grown(1, 1).clipped(frame.region)
     areas = patch_areas(frame, config, ranges)
@@ -220,10 +211,9 @@ def _mark_ends(raw: Raw, flat: np.ndarray, search: Disparity) -> None:
 
 
 def _reject_ends(raw: Raw, least: np.ndarray, most: np.ndarray, search: Disparity) -> None:
-    """Reject winners at or next to an end of their cell's range, unless the whole range ends there.
+    """Reject winners at or next to an end, ``least`` or ``most``, of their cell's range where the whole range goes on.
 
     They may not be minima of the cost. The cross-check would reject most of them in a search of the whole range.
-    ``least`` and ``most`` are those ends.
     """
     ends = (raw.winner <= least + 1) & (least > search.minimum)
     ends |= (raw.winner >= most - 1) & (most < search.maximum)

@@ -96,8 +96,8 @@ class ConfidenceScale(NamedTuple):
 def confidence_scale(settings: Ambiguity, histogram: np.ndarray) -> ConfidenceScale:
     """Scale of confidence: given figures, the whole range, or percentiles of the whole image.
 
-    ``histogram`` counts the ambiguities, ``0 .. etas * count``, of all pixels with a possible candidate. Equal
-    percentiles cannot rank pixels, so the whole range replaces them.
+    ``histogram`` counts the ambiguities of all pixels with a possible candidate. Equal percentiles cannot rank pixels,
+    so the whole range replaces them.
     """
     if settings.p1 is not None and settings.p99 is not None:
         return ConfidenceScale(settings.p1, settings.p99)
@@ -118,7 +118,23 @@ def postprocess_rows(rows: RawRows, first: int, last: int, scale: ConfidenceScal
 
     ``rows`` has these rows and at least `halo` rows above and below, inside the region.
     """
-    return finish_rows(filter_rows(rows, scale, config), first, last, config)
+    filtered = filter_rows(rows, scale, config)
+    inner, cuts = slice(first, last), config.cuts
+    validity, low = filtered.validity[inner].copy(), filtered.low
+    lower, upper = filtered.lower[inner], filtered.upper[inner]
+    if config.regularization:
+        quantile = cuts.quantile if cuts else config.regularization.quantile
+        lower, upper = regularized(filtered, first, last, config, quantile)
+        assert low is not None
+        validity[low[inner]] |= REGULARIZED
+    if config.fits and cuts:
+        assert low is not None  # a coverage needs both classes
+        fits = filtered.fits(inner)
+        bounds = bounds_of_both(fits, filtered.lower[inner], filtered.upper[inner], cuts.high, config)
+        lower, upper = (np.where(low[inner], old, new) for new, old in zip(bounds, (lower, upper), strict=True))
+    disparity = np.where(filtered.written[inner], filtered.disparity[inner], np.float32(np.nan))
+    bands = Bands(disparity, *widened(lower, upper, disparity, config), filtered.confidence[inner], validity)
+    return bands._replace(sigma=filtered.deviation[inner]) if config.products.sigma else bands
 
 
 def filter_rows(rows: RawRows, scale: ConfidenceScale, config: Config) -> Filtered:
@@ -130,8 +146,12 @@ def filter_rows(rows: RawRows, scale: ConfidenceScale, config: Config) -> Filter
         validity |= cross_check(rows.winner, rows.right_winner, config.disparity.minimum, tolerance)
     kept = searched & (validity & INVALID == 0)
     confidence = normalize(rows.ambiguity, searched, scale.p1, scale.p99)
-    if config.opens_ends:
-        _open_ends(rows, validity, confidence, config)
+    if config.opens_ends:  # beyond the ends of the range the true disparity may be
+        ends = validity & RANGE_END != 0
+        confidence[ends] = 0
+        if config.interval:
+            below = rows.winner <= config.disparity.minimum + 1
+            validity[ends] |= np.where(below[ends], OPEN_BELOW, OPEN_ABOVE).astype(validity.dtype)
     low = None
     if config.regularization:
         low = low_confidence(confidence, config.regularization.threshold, config.regularization.kernel)
@@ -144,24 +164,6 @@ def filter_rows(rows: RawRows, scale: ConfidenceScale, config: Config) -> Filter
         validity[np.isfinite(deviation)] &= ~np.uint16(NOT_REFINED)
     written = searched if config.products.keep_rejected else kept
     return Filtered(disparity, lower, upper, confidence, validity, low, written, deviation)
-
-
-def finish_rows(rows: Filtered, first: int, last: int, config: Config) -> Bands:
-    """Regularise, and complete the final bands of the rows ``[first, last)``; see `postprocess_rows`."""
-    inner, cuts = slice(first, last), config.cuts
-    validity = rows.validity[inner].copy()
-    lower, upper = rows.lower[inner], rows.upper[inner]
-    if config.regularization:
-        lower, upper = regularized(rows, first, last, config, cuts.quantile if cuts else config.regularization.quantile)
-        assert rows.low is not None
-        validity[rows.low[inner]] |= REGULARIZED
-    if config.fits and cuts:
-        assert rows.low is not None  # a coverage needs both classes
-        bounds = bounds_of_both(rows.fits(inner), rows.lower[inner], rows.upper[inner], cuts.high, config)
-        lower, upper = (np.where(rows.low[inner], old, new) for new, old in zip(bounds, (lower, upper), strict=True))
-    disparity = np.where(rows.written[inner], rows.disparity[inner], np.float32(np.nan))
-    bands = Bands(disparity, *widened(lower, upper, disparity, config), rows.confidence[inner], validity)
-    return bands._replace(sigma=rows.deviation[inner]) if config.products.sigma else bands
 
 
 def widened(
@@ -177,23 +179,10 @@ def widened(
     return lower, upper
 
 
-def _open_ends(rows: RawRows, validity: np.ndarray, confidence: np.ndarray, config: Config) -> None:
-    """Set the confidence of winners at the ends of the search range to 0, and open their intervals.
-
-    The true disparity may be outside the range.
-    """
-    ends = validity & RANGE_END != 0
-    confidence[ends] = 0
-    if config.interval:
-        below = rows.winner <= config.disparity.minimum + 1
-        validity[ends] |= np.where(below[ends], OPEN_BELOW, OPEN_ABOVE).astype(validity.dtype)
-
-
 def _bounds(rows: RawRows, low: np.ndarray | None, kept: np.ndarray, config: Config) -> tuple[np.ndarray, np.ndarray]:
     """Both bounds in pixels as float32, of the level of each pixel's class, after the median.
 
-    With least squares the cuts of the two classes differ much, so each is filtered on its own. Values where nothing was
-    searched are never written.
+    With least squares the cuts of the two classes differ much, so each is filtered on its own.
     """
     if config.interval is None:
         nothing = np.full(rows.lower.shape, np.float32(np.nan))
@@ -223,22 +212,15 @@ def regularized(
     rows: Filtered, first: int, last: int, config: Config, quantile: float | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Regularised bounds of the rows ``[first, last)``; those before without a quantile."""
-    settings, low = config.regularization, rows.low
     if quantile is None:
         return rows.lower[first:last], rows.upper[first:last]
+    settings = config.regularization
     assert settings is not None
-    assert low is not None
-    top, bottom = max(0, first - settings.depth), last + settings.depth
-    lower, upper = regularize(
-        rows.lower[top:bottom],
-        rows.upper[top:bottom],
-        low[top:bottom],
-        config.disparity.minimum,
-        settings.depth,
-        quantile,
-        (first - top, last - top),
-        max(2, min(_STEPS, config.bound_steps)),
-    )
+    top = max(0, first - settings.depth)
+    near = cut_rows(rows, top, last + settings.depth)
+    search, steps = config.disparity, max(2, min(_STEPS, config.bound_steps))
+    wanted = first - top, last - top
+    lower, upper = regularize(near.lower, near.upper, near.low, search.minimum, settings.depth, quantile, wanted, steps)
     return lower, upper
 
 
@@ -267,12 +249,12 @@ def with_halo(strips: Iterable[Rows], margin: int) -> Iterator[tuple[Rows, int, 
     """Add rows above and below to records of full-width rows, given strip by strip from the top.
 
     Yields ``(record, first, last)``: the rows ``[first, last)`` have ``margin`` rows above and below, fewer at the
-    image's ends. Each row of the image is in one such range.
+    image's ends.
     """
     waiting: Rows | None = None
     first = 0
     for strip in strips:
-        waiting = strip if waiting is None else _like(strip, map(np.concatenate, zip(waiting, strip, strict=True)))
+        waiting = strip if waiting is None else type(strip)(*map(np.concatenate, zip(waiting, strip, strict=True)))
         last = len(waiting[0]) - margin
         if last > first:
             yield waiting, first, last
@@ -284,8 +266,4 @@ def with_halo(strips: Iterable[Rows], margin: int) -> Iterator[tuple[Rows, int, 
 
 def cut_rows(rows: Rows, first: int, last: int) -> Rows:
     """Cut the rows ``[first, last)`` of a record."""
-    return _like(rows, (array[first:last] for array in rows))
-
-
-def _like(record: Rows, arrays: Iterable[np.ndarray]) -> Rows:
-    return type(record)(*arrays)
+    return type(rows)(*(array[first:last] for array in rows))

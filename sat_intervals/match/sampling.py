@@ -1,7 +1,4 @@
-"""BlockMatch at blocks spread over a pair at full resolution: how noisy it is, and how far its rows differ.
-
-Letters: r row, c column.
-"""
+"""Match blocks spread over a pair at full resolution: how noisy it is, and how far its rows differ."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -80,10 +77,7 @@ def _starts(first: int, size: int) -> list[int]:
 
 
 def block_match(sample: SampleBlock, left: View, right: View) -> BlockMatch | None:
-    """Match a block coarsely, then a part of it at full resolution; None if too little is matched.
-
-    ``left`` and ``right`` are the views of the sample.
-    """
+    """Match the views of a block coarsely, then a part at full resolution; None if too little is matched."""
     if (coarse := _coarse(left, right)) is None:
         return None
     matches, rows = coarse
@@ -94,14 +88,11 @@ def block_match(sample: SampleBlock, left: View, right: View) -> BlockMatch | No
         found = _fine(here, cut(right, there.grown(4, 4)), sample.minimum + first)
         if found is None:
             return None
-        figures, shift = found
-        if abs(shift) <= 0.5:  # of rows farther apart too little is matched well
-            break
-        rows += round(shift)
-    else:
-        return None
-    middle = part.row + (part.height - 1) / 2, figures.column + part.column + (part.width - 1) / 2
-    return figures._replace(row=middle[0], column=middle[1], rows=rows + shift)
+        if abs(found.rows) <= 0.5:  # of rows farther apart too little is matched well
+            row, column = part.row + (part.height - 1) / 2, found.column + part.column + (part.width - 1) / 2
+            return found._replace(row=row, column=column, rows=rows + found.rows)
+        rows += round(found.rows)
+    return None
 
 
 def _coarse(left: View, right: View) -> tuple[Matches, int] | None:
@@ -166,11 +157,8 @@ def _part(matches: Matches, block: Window) -> tuple[Window, int, int]:
     return part, int(low) - more, int(high) + more
 
 
-def _fine(left: View, right: View, minimum: int) -> tuple[BlockMatch, float] | None:
-    """Match a part and measure its rows; ``right`` is grown by 4 pixels. None if too little is matched.
-
-    The place of the figures is the median disparity.
-    """
+def _fine(left: View, right: View, minimum: int) -> BlockMatch | None:
+    """Match a part; ``right`` is grown by 4 pixels. The column is the median disparity. None with too few matches."""
     inner = right.cropped(right.window.grown(-4, -4))
     here, there = (np.ma.array(view.pixels, mask=view.state != 0) for view in (left, inner))
     found = match_whole(here, there, settings(0, inner.window.width - left.window.width))
@@ -194,7 +182,7 @@ def _fine(left: View, right: View, minimum: int) -> tuple[BlockMatch, float] | N
     column = np.arange(index.shape[1])
     random = _distances(*codes, (index + _AWAY + column) % codes[1].state.shape[1] - column, 0)[where].mean()
     middle = float(np.median(disparity[known])) + minimum
-    return BlockMatch(0.0, middle, int(known.sum()), float(known.mean()), float(matched), float(random), 0.0), shift
+    return BlockMatch(0.0, middle, int(known.sum()), float(known.mean()), float(matched), float(random), shift)
 
 
 def _shifts(equations: np.ndarray, pixels: np.ndarray) -> np.ndarray:

@@ -40,9 +40,8 @@ class Step(NamedTuple):
 
 def needs(blocks: Grid, step: Step, together: int = 1) -> list[Step]:
     """Return the steps whose results a step takes over; of several tiles ``together`` also those inside the block."""
-    found = (
-        [Step(step.block, wavefront) for wavefront in range(LAST)] if together > 1 and step.wavefront is None else []
-    )
+    inside = LAST if together > 1 and step.wavefront is None else 0
+    found = [Step(step.block, wavefront) for wavefront in range(inside)]
     for wavefront in range(len(WAVEFRONTS)) if step.wavefront is None else (step.wavefront,):
         for rows, columns in sources(wavefront):
             row, column = step.block.grid_row + rows, step.block.grid_column + columns

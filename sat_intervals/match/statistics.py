@@ -38,14 +38,10 @@ class Tally:
 
     def counts(self) -> dict[str, list[list[int]]]:
         """Return all counts, each with its place; `merge` adds them."""
+        found = {name: getattr(self, f"_{name}") for name in ("ends", "agreement", "sums", "widths")}
         return {
             name: [[int(place), int(counts[place])] for place in np.flatnonzero(counts)]
-            for name, counts in (
-                ("ends", self._ends),
-                ("agreement", self._agreement),
-                ("sums", self._sums),
-                ("widths", self._widths),
-            )
+            for name, counts in found.items()
         }
 
     def merge(self, counts: Mapping[str, Sequence[Sequence[int]]]) -> None:
@@ -59,18 +55,15 @@ class Tally:
         return int(self._sums[wanted].sum())
 
     def report(self) -> dict[str, Any]:
-        """Counts of pixels, and the median width in pixels, to 0.01, None where there is no interval.
+        """Counts of pixels, and the median width in pixels, None where there is no interval.
 
-        ``ambiguous``: valid, with the whole search range as interval. ``range_ends``: valid, with the flag range_end
-        and without range_incomplete, by the end. ``flags`` counts a pixel under each of its flags, ``causes`` each
-        invalid pixel once, see `products.cause`: with ``valid`` they sum to ``pixels``. ``agreement``: pixels whose
-        given disparity is outside or inside the interval.
+        ``ambiguous``: valid, with the whole search range as interval. ``flags`` counts a pixel under each of its flags,
+        ``causes`` each invalid pixel once, see `products.cause`: with ``valid`` they sum to ``pixels``.
         """
         upto = np.cumsum(self._widths)
-        median = float(np.searchsorted(upto, upto[-1] / 2) * _WIDTH_STEP) if upto[-1] else None
+        median = round(float(np.searchsorted(upto, upto[-1] / 2) * _WIDTH_STEP), 2) if upto[-1] else None
         sums = np.arange(self._sums.size)
-        valid = sums & INVALID == 0
-        causes = cause(sums)
+        valid, causes = sums & INVALID == 0, cause(sums)
         return {
             "pixels": int(self._sums.sum()),
             "valid": self._count(valid),
@@ -80,5 +73,5 @@ class Tally:
             "causes": {flag.name: self._count(causes == flag.value) for flag in FLAGS if flag.invalid},
             "range_ends": {"minimum": int(self._ends[0]), "maximum": int(self._ends[1])},
             "agreement": {"outside": int(self._agreement[0]), "inside": int(self._agreement[1])},
-            "median_interval_width": None if median is None else round(median, 2),
+            "median_interval_width": median,
         }

@@ -8,7 +8,7 @@ import numpy as np
 from sat_intervals.config import Config, ConfigError, Volume
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.cost import Costs, padded_to_lanes
-from sat_intervals.match.matching_cost import Area, AreaCosts, Given, PairCost
+from sat_intervals.match.matching_cost import Area, AreaCosts, Given, MatchingCost
 from sat_intervals.products import LOG_SPAN
 from sat_intervals.tiling import Views, strips
 
@@ -21,11 +21,10 @@ def _section(config: Config) -> Volume:
     return config.cost
 
 
-class VolumeCost(PairCost):
+class VolumeCost(MatchingCost):
     """Values of ``volume_of``."""
 
     def __init__(self, config: Config, given: Given) -> None:
-        """Raise without the function that makes volumes."""
         super().__init__(config, given)
         self.check(config)
         if given.volume_of is None:
@@ -48,11 +47,10 @@ class VolumeCost(PairCost):
 
     def _made(self, views: Views, area: Area) -> np.ndarray:
         margin = self._config.cost.window // 2
+        windows = area.base.grown(margin, margin), area.facing.grown(margin, margin)
         left, right = (
             np.ma.array(view.inner(view.pixels, there), mask=view.inner(view.state, there) != 0)
-            for view, there in zip(
-                views, (area.base.grown(margin, margin), area.facing.grown(margin, margin)), strict=True
-            )
+            for view, there in zip(views, windows, strict=True)
         )
         values = unmasked(self._volume_of(left, right, area.minimum))
         needed = (area.base.height, area.base.width, area.disparities)

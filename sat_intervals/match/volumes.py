@@ -7,7 +7,6 @@ import numpy as np
 import xarray as xr
 
 from sat_intervals.config import Config, ConfigError, load_config, resolved
-from sat_intervals.kernels.curves import read_right_winners
 from sat_intervals.kernels.disparity import cross_check
 from sat_intervals.match.external import ExternalVolume, open_external
 from sat_intervals.match.labelled import labelled
@@ -117,8 +116,7 @@ def matched_volume(
     is_plain = right is None and external.step == 1 and external.kind != "probability"
     if checks and not is_plain:
         config = config.model_copy(update={"cross_check": None})
-    patch = match_patch(PatchFrame.of_whole(Window(0, 0, rows, columns)), [cost], config)
-    raw = patch.raw
+    raw, _, right_view, _ = match_patch(PatchFrame.of_whole(Window(0, 0, rows, columns)), [cost], config)
     if not (raw.winner != NO_DISPARITY).any():
         raise ConfigError("the volume has no finite value at any valid pixel")
     np.copyto(raw.validity, flags, where=flags != 0)
@@ -131,7 +129,7 @@ def matched_volume(
         whole = np.clip(np.floor(found + 0.5), minimum, last).astype(np.int16)
         whole[raw.winner == NO_DISPARITY] = NO_DISPARITY
         np.bitwise_or(raw.validity, cross_check(whole, winners, minimum, checks.tolerance), out=raw.validity)
-    return RawRows.of(raw, patch.right), config
+    return RawRows.of(raw, right_view), config
 
 
 def flags_of(valid: Any, shape: tuple[int, ...]) -> np.ndarray:
@@ -151,13 +149,9 @@ def flags_of(valid: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 def _of_right(external: ExternalVolume, right: Values, config: Config) -> tuple[int, np.ndarray]:
     """Return the winners of another volume, in the layout of `cross_check`, and the first disparity of that layout."""
-    labelled_alone = isinstance(right, xr.Dataset | xr.DataArray)
-    there = open_external(
-        right,
-        None if labelled_alone else -external.disparities[::-1],
-        external.kind,
-        None if external.kind == "probability" else (external.lowest, external.highest),
-    )
+    disparities = None if isinstance(right, xr.Dataset | xr.DataArray) else -external.disparities[::-1]
+    span = None if external.kind == "probability" else (external.lowest, external.highest)
+    there = open_external(right, disparities, external.kind, span)
     if there.shape[0] != external.shape[0]:
         raise ConfigError(f"the right volume has {there.shape[0]} rows, the left one {external.shape[0]}")
     settings = volume_config(there, config)
@@ -190,6 +184,25 @@ def _of_diagonals(external: ExternalVolume, flags: np.ndarray, config: Config) -
         costs[costs == config.impossible_cost] = IMPOSSIBLE_COST
         found.append(read_right_winners(costs, minimum))
     return minimum, np.concatenate(found)
+
+
+def read_right_winners(volume: np.ndarray, minimum: int) -> np.ndarray:
+    """Winners of right pixels along the diagonals of a left volume; the largest disparity at ties.
+
+    volume: ``(rows, columns, count)`` uint16, IMPOSSIBLE_COST at impossible candidates.
+    Returns ``(rows, columns + count - 1)`` int16 as `cross_check` takes it.
+    """
+    rows, columns, count = volume.shape
+    width = columns + count - 1
+    winner = np.full((rows, width), NO_DISPARITY, np.int16)
+    for r in range(rows):
+        # Each line is one longer than the right image: read as lines of its width, each begins one column later.
+        sheared = np.full((count, width + 1), IMPOSSIBLE_COST, np.uint16)
+        sheared[:, :columns] = volume[r].T
+        facing = sheared.ravel()[: count * width].reshape(count, width)[::-1]
+        found = (facing != IMPOSSIBLE_COST).any(axis=0)
+        winner[r, found] = minimum + count - 1 - facing.argmin(axis=0)[found]
+    return winner
 
 
 def _in_pixels(bands: Bands, external: ExternalVolume, config: Config) -> Bands:

@@ -16,10 +16,7 @@ from sat_intervals.tiling import View, Window
 
 
 def compile_kernels(config: Config, *, hands_states_on: bool = True) -> None:
-    """Compile every kernel that the settings need, by matching a few random pixels.
-
-    ``hands_states_on``: whether tiles hand path states on, where the settings ask for it. A single tile does not.
-    """
+    """Compile every kernel that the settings need by matching a few pixels; a single tile hands no states on."""
     random = np.random.default_rng(0)
     search = config.disparity
     frame = PatchFrame.of_whole(Window(0, 0, 4, 4))

@@ -8,11 +8,11 @@ from sat_intervals.match.costs import cost_of
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.matching_cost import Given
 from sat_intervals.match.normalization import PairStatistics
-from sat_intervals.match.patch import Patch, PatchFrame, match_patch, patch_areas
+from sat_intervals.match.patch import PatchFrame, match_patch, patch_areas
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_rows
 from sat_intervals.match.refinement import pixel_windows, pixels_of
 from sat_intervals.products import NO_DATA, NO_DISPARITY, Bands
-from sat_intervals.tiling import View, Views, Window
+from sat_intervals.tiling import View, Window
 
 
 def match_whole(
@@ -22,18 +22,19 @@ def match_whole(
     statistics: PairStatistics | None = None,
     ranges: LocalRanges | None = None,
 ) -> Bands:
-    """Match two images of finite floats, ``(rows, columns)``; masked pixels are no data.
-
-    ``statistics`` are those of the images; None if the matching cost needs none. ``ranges`` are local search ranges;
-    None: all pixels search the whole range.
-    """
+    """Match two images of finite floats, ``(rows, columns)``; masked pixels are no data."""
     frame = PatchFrame.of_whole(Window(0, 0, *left.shape))
     cost, areas = cost_of(config, Given(statistics)), patch_areas(frame, config, ranges)
     windows = cost.windows(areas)
     whole = whole_view(left), whole_view(right)
     views = cut(whole[0], windows[0]), cut(whole[1], windows[1])
     patch = match_patch(frame, cost.of_areas(views, areas), config, ranges=ranges)
-    return finish_whole(whole_rows(patch, whole, frame.whole, config), config)
+    rows = RawRows.of(patch.raw, patch.right)
+    if config.fits:
+        windows = pixel_windows(frame.whole, config)
+        pixels = pixels_of((cut(whole[0], windows[0]), cut(whole[1], windows[1])))
+        rows = rows._replace(left=pixels[0], right=pixels[1])
+    return finish_whole(rows, config)
 
 
 def scale_of_rows(rows: RawRows, config: Config) -> ConfidenceScale:
@@ -47,16 +48,6 @@ def scale_of_rows(rows: RawRows, config: Config) -> ConfidenceScale:
 def finish_whole(rows: RawRows, config: Config) -> Bands:
     """Return the final bands of the rows of a whole image."""
     return postprocess_rows(rows, 0, len(rows.winner), scale_of_rows(rows, config), config)
-
-
-def whole_rows(patch: Patch, views: Views, window: Window, config: Config) -> RawRows:
-    """Return the rows of a pair that was matched as one tile, with the pixels that the settings need."""
-    rows = RawRows.of(patch.raw, patch.right)
-    if config.fits:
-        windows = pixel_windows(window, config)
-        left, right = pixels_of((cut(views[0], windows[0]), cut(views[1], windows[1])))
-        rows = rows._replace(left=left, right=right)
-    return rows
 
 
 def whole_view(image: np.ma.MaskedArray) -> View:

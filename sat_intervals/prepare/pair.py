@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, Self
+from typing import Any
 
 import numpy as np
 
@@ -16,38 +16,8 @@ from sat_intervals.prepare.local import given_ranges
 from sat_intervals.raster import Image, read_window
 from sat_intervals.tiling import View, Window
 
-
-class Pair(Protocol):
-    """Two images; side 0 is the left one. Where workers are processes it is picklable."""
-
-    @property
-    def names(self) -> tuple[str, str]:
-        """Return what messages call both images."""
-
-    @property
-    def shapes(self) -> tuple[tuple[int, int], tuple[int, int]]:
-        """Return rows and columns of both images."""
-
-    def is_plain(self, side: int) -> bool:
-        """Return whether nothing declares pixels of an image as no data."""
-
-    def view(self, side: int, window: Window) -> View:
-        """Read a window, which may leave the image: beyond it there is no data."""
-
-    def given_ranges(self, search: Disparity) -> tuple[LocalRanges, str] | None:
-        """Return local search ranges that are given, and what gives them; None without."""
-
-    def with_rows(self, rows: RowOffsets | None) -> Self:
-        """Return the pair with row offsets taken out of the right image."""
-
-
-class Each(Protocol):
-    """Calls a function with each of some arguments."""
-
-    def __call__(
-        self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], stage: str
-    ) -> Iterator[tuple[int, Any]]:
-        """Yield results with the number of their arguments, in any order."""
+Each = Callable[[Callable[..., Any], Sequence[tuple[Any, ...]], str], Iterator[tuple[int, Any]]]
+"""Calls a function with each of some arguments in a stage; yields results with the number of their arguments."""
 
 
 def is_plain(image: Image) -> bool:
@@ -57,14 +27,14 @@ def is_plain(image: Image) -> bool:
 
 @dataclass(frozen=True)
 class FilePair:
-    """A pair of files."""
+    """A pair of files; side 0 is the left one. Where workers are processes it is picklable."""
 
     left: Image
     right: Image
 
     @property
     def names(self) -> tuple[str, str]:
-        """Return the paths."""
+        """Return what messages call both images."""
         return self.left.path, self.right.path
 
     @property
@@ -73,15 +43,15 @@ class FilePair:
         return (self.left.height, self.left.width), (self.right.height, self.right.width)
 
     def is_plain(self, side: int) -> bool:
-        """Return whether an image has neither no-data value nor mask nor alpha."""
+        """Return whether nothing declares pixels of an image as no data."""
         return is_plain((self.left, self.right)[side])
 
     def view(self, side: int, window: Window) -> View:
-        """Read a window of a file; runs on a worker."""
+        """Read a window, which may leave the image: beyond it there is no data. Runs on a worker."""
         return View(window, *read_window((self.left, self.right)[side], window))
 
     def given_ranges(self, search: Disparity) -> tuple[LocalRanges, str] | None:
-        """Read the ranges of a raster that the settings name."""
+        """Return local search ranges that a raster gives, and its path; None without."""
         return given_ranges(search, self.left)
 
     def with_rows(self, rows: RowOffsets | None) -> "FilePair":
@@ -95,7 +65,6 @@ class ArrayPair:
     names = "the left array", "the right array"
 
     def __init__(self, left: np.ma.MaskedArray, right: np.ma.MaskedArray, disparity: np.ndarray | None = None) -> None:
-        """Keep images and disparities."""
         self.images, self.disparity = (left, right), disparity
         self.shapes = left.shape, right.shape
         self._views = whole_view(left), whole_view(right)
@@ -125,6 +94,9 @@ class ArrayPair:
         wider = self.view(1, Window(first, 0, count, self.shapes[1][1]))
         pixels, state = shift_rows(wider.pixels, wider.state, *places)
         return ArrayPair(self.images[0], np.ma.array(pixels, mask=state != 0), self.disparity)
+
+
+Pair = FilePair | ArrayPair
 
 
 def here(

@@ -5,20 +5,21 @@ from dataclasses import asdict, dataclass
 from typing import Any, Generic, TypeVar
 
 from sat_intervals.config import Config, resolved
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import InputError, SatIntervalsError
 from sat_intervals.kernels.row_offsets import RowOffsets
 from sat_intervals.match.around import with_hull
-from sat_intervals.match.coarse import Found, with_range
+from sat_intervals.match.coarse import Found, settings, with_range
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.normalization import Moments, PairStatistics, blocks, moments, statistics_of
-from sat_intervals.match.parallax import Survey
-from sat_intervals.prepare.block_matches import measured_parallax
-from sat_intervals.prepare.pair import Each, Pair, here
+from sat_intervals.match.parallax import Survey, fit_rows
+from sat_intervals.match.sampling import BlockMatch, SampleBlock, block_match, noise_of, sample_blocks
+from sat_intervals.match.warm_up import compile_kernels
+from sat_intervals.prepare.pair import ArrayPair, Each, FilePair, Pair, here
 from sat_intervals.prepare.search_range import found_range
 from sat_intervals.products import plain
 from sat_intervals.tiling import Window
 
-P = TypeVar("P", bound=Pair)
+P = TypeVar("P", FilePair, ArrayPair)
 
 
 @dataclass(frozen=True)
@@ -65,8 +66,7 @@ def prepare(
     """Find what the settings leave open.
 
     ``region`` of the left image is matched, by default all; search ranges and statistics are always those of the whole
-    images. ``known`` is from `Prepared.known` of the same images. ``measures_rows``: whether rows are measured
-    without need.
+    images. ``known`` is from `Prepared.known` of the same images. ``measures_rows``: also where ``rows`` is none.
     """
     config, known = resolved(config), known or {}
     whole = Window(0, 0, *pair.shapes[0])
@@ -108,6 +108,24 @@ def _surveyed(pair: Pair, config: Config, each: Each, region: Window, known: Map
         if (survey.region, survey.search) == (region, search):
             return survey
     return measured_parallax(pair, region, search, each)
+
+
+def measured_parallax(pair: Pair, region: Window, search: tuple[int, int], each: Each) -> Survey:
+    """Measure noise and row offsets of a pair at blocks of a region of the left image, over a search range."""
+    compile_kernels(settings(0, 3), hands_states_on=False)
+    blocks = [(pair, sample) for sample in sample_blocks(region, *search)]
+    found = dict(each(match_at, blocks, "rows"))
+    samples = [found[number] for number in range(len(blocks)) if found[number] is not None]
+    return Survey(region, search, noise_of(samples), fit_rows(samples, *pair.shapes[1]))
+
+
+def match_at(pair: Pair, sample: SampleBlock) -> BlockMatch | None:
+    """Match a block; None where it cannot be read: its tiles will say so. Runs on a worker."""
+    try:
+        left, right = (pair.view(side, window) for side, window in enumerate(sample.views))
+    except InputError:
+        return None
+    return block_match(sample, left, right)
 
 
 def _measured(pair: Pair, rows: RowOffsets | None, each: Each, known: Mapping[str, Any]) -> PairStatistics:

@@ -6,16 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.match.coarse import (
-    Found,
-    NoRangeError,
-    Step,
-    find_range,
-    finest_step,
-    reduced,
-    settings,
-    undeclared_border,
-)
+from sat_intervals.match import coarse
+from sat_intervals.match.coarse import Found, NoRangeError, Step
 from sat_intervals.match.memory import check_memory
 from sat_intervals.match.normalization import BLOCK, blocks
 from sat_intervals.match.warm_up import compile_kernels
@@ -32,18 +24,18 @@ def found_range(pair: Pair, each: Each) -> Found:
     for name, (rows, columns) in zip(pair.names, pair.shapes, strict=True):
         number = len(Grid(Window(0, 0, rows, columns), BLOCK))
         check_memory(_TASK * number, f"{name}: {rows} x {columns} pixels in {number} blocks", "is it the right file?")
-    compile_kernels(settings(0, 3))
-    step = finest_step(pair.shapes[0][0], max(columns for _, columns in pair.shapes))
+    compile_kernels(coarse.settings(0, 3))
+    step = coarse.finest_step(pair.shapes[0][0], max(columns for _, columns in pair.shapes))
     small, undeclared = [], dict[str, Any]()
     for side, name in enumerate(("left", "right")):
         pixels, smallest = _reduced(pair, side, step, each)
-        found = undeclared_border(pixels, smallest)
+        found = coarse.undeclared_border(pixels, smallest)
         if pair.is_plain(side) and found.mean() > UNDECLARED:
             undeclared[name] = {"value": smallest, "share": round(float(found.mean()), 4)}
             pixels[found] = np.nan
         small.append(pixels)
     try:
-        found_range = find_range(small[0], small[1], step, pair.shapes[0])[0].fitted(pair.shapes[1][1])
+        search = coarse.find_range(small[0], small[1], step, pair.shapes[0])[0].fitted(pair.shapes[1][1])
     except NoRangeError as error:
         hints = "".join(f"; {line}" for line in undeclared_lines(undeclared, pair.names))
         raise NoRangeError(
@@ -51,14 +43,14 @@ def found_range(pair: Pair, each: Each) -> Found:
             "Python disparity minimum and maximum), or check that the images are an epipolar pair: raw ones go to "
             "sat-intervals surface, or to rectify first, with the --altitude of the ground"
         ) from None
-    return replace(found_range, undeclared=undeclared)
+    return replace(search, undeclared=undeclared)
 
 
 def reduce_block(pair: Pair, side: int, block: Window, step: Step) -> tuple[np.ndarray, float]:
     """Return a block of an image at the finest level, and its smallest usable pixel; runs on a worker."""
     _, pixels, state = pair.view(side, block)
     smallest = pixels.min(where=state == 0, initial=np.inf)
-    return reduced(pixels, state, step), float(smallest)
+    return coarse.reduced(pixels, state, step), float(smallest)
 
 
 def _reduced(pair: Pair, side: int, step: Step, each: Each) -> tuple[np.ndarray, float]:

@@ -82,8 +82,8 @@ def test_contradiction__names_no_median_above_the_maximum():
     assert (median, most) == (8.2, 8.4)
 
 
-def survey_of(samples):
-    return Survey.of_matches(Window(0, 0, 1000, 1000), (-9, 9), samples, (1000, 1000))
+def survey_of(samples, side=1000, columns=1000):
+    return Survey(Window(0, 0, side, side), (-9, 9), 0.5, fit_rows(samples, columns, columns))
 
 
 def test_survey__takes_out_what_is_large_enough():
@@ -102,6 +102,6 @@ def test_fit_rows__does_not_judge_places_far_from_the_sample_blocks():
         sample._replace(row=sample.row / 4, column=sample.column / 4)
         for sample in samples_at(lambda r, c: 0.002 * (r - c))
     ]
-    survey = Survey.of_matches(Window(0, 0, 250, 250), (-9, 9), near, (20_000, 20_000))
+    survey = survey_of(near, 250, 20_000)
     assert survey.rows.most < 5
     assert survey.taken("auto") is not None

@@ -10,7 +10,6 @@ from volumes import softmax, volume_of
 
 from sat_intervals import SatIntervalsError, intervals_of, load_config, match_arrays
 from sat_intervals.demo import make_scene
-from sat_intervals.kernels.curves import read_right_winners
 from sat_intervals.kernels.disparity import cross_check
 from sat_intervals.products import IMPOSSIBLE_COST, INVALID, MISMATCH, NO_CANDIDATE, OCCLUSION
 
@@ -138,8 +137,8 @@ def test_intervals_of__takes_fractions_of_pixels(step):
         np.testing.assert_allclose(found[name], 3.1 + step * whole[name], atol=1e-5)
     checked = intervals_of(values, step * np.arange(25), kind="cost", span=11)
     every, last = round(1 / step), int(24 * step)
-    costs = np.where(np.isnan(values), IMPOSSIBLE_COST, values).astype(np.uint16)
-    right = read_right_winners(costs[:, :, ::every], 0)
+    costs = np.where(np.isnan(values), IMPOSSIBLE_COST, values).astype(np.int64)
+    right = reference.absolute(reference.right_winners(costs[:, :, ::every])[0], 0).astype(np.int16)
     winner = np.clip(np.floor(step * costs.argmin(axis=2) + 0.5), 0, last).astype(np.int16)
     np.testing.assert_array_equal(
         checked["validity"].data & (OCCLUSION | MISMATCH), cross_check(winner, right, 0, PAPER.cross_check.tolerance)
