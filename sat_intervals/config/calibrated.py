@@ -6,10 +6,7 @@ from sat_intervals.config.settings import Config, key_of
 
 
 def calibration_of(config: Config) -> Calibration:
-    """Return the calibration of the settings: the one that they give, else the built-in one with their key.
-
-    If there is none, the error names the first difference.
-    """
+    """Return the calibration of the settings: the one that they give, else the built-in one with their key."""
     assert config.interval is not None
     given, key = config.interval.calibration, key_of(config)
     if not isinstance(given, Calibration):

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from decimal import Decimal
 from fractions import Fraction
+from importlib.metadata import PackageNotFoundError, files
 from math import floor
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args
@@ -13,11 +14,16 @@ from pydantic import AfterValidator, Field, model_validator
 
 from sat_intervals.config.penalties import AnySgm
 from sat_intervals.config.sections import Exact, Odd, Section, absolute
-from sat_intervals.config.weights import NETWORKS, weights_file
+from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import COSINE_STEPS
 
 # Integer costs of a external volume, at most: without SGM, and with it together with P2.
 _LEVELS, _SGM_LEVELS = 50_000, 8_190
+# The distribution of the official weights, and its files: the one that Pandora uses, and one of depthwise convolutions.
+_DISTRIBUTION = "MCCNN"
+NETWORKS = {"full": "mc_cnn_fast_int8_excl_01.onnx", "depthwise": "mc_cnn_fast_dw.onnx"}
+INSTALL_MCCNN = "pip install 'sat-intervals[mccnn]'"
+_NAMES = " or ".join(NETWORKS)
 
 
 class Numbers(NamedTuple):
@@ -94,6 +100,23 @@ class Census(_Cost):
             raise ValueError("sgm.span is given, but with cost.method census it follows from p2: leave it out")
         if fraction := [name for name in ("p1", "p2") if getattr(sgm, name) % 1]:
             raise ValueError(f"sgm.{fraction[0]} is {getattr(sgm, fraction[0])}, allowed: whole numbers with census")
+
+
+def weights_file(weights: str) -> Path:
+    """Find the file of a network: a given one, or an official one without an import of its package."""
+    if weights not in NETWORKS:
+        if not Path(weights).is_file():
+            raise SatIntervalsError(f"cost.weights {weights}: no such file: name an ONNX network, or {_NAMES}")
+        return Path(weights).resolve()
+    try:
+        found = [file for file in files(_DISTRIBUTION) or [] if file.name == NETWORKS[weights]]
+    except PackageNotFoundError as error:
+        raise SatIntervalsError(f"cost mccnn needs the package {_DISTRIBUTION}: {INSTALL_MCCNN}") from error
+    if not found:
+        raise SatIntervalsError(
+            f"the installed {_DISTRIBUTION} has no {NETWORKS[weights]}: {INSTALL_MCCNN}, or set cost.weights"
+        )
+    return Path(str(found[0].locate())).resolve()
 
 
 class Mccnn(_Cost):

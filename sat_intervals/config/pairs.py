@@ -95,12 +95,7 @@ def is_pair(path: Path) -> bool:
 
 
 def find_pairs(paths: Iterable[str | Path]) -> list[Pair]:
-    """Read pairs from folders and tables, in their order.
-
-    A folder holds ``left.tif``, ``right.tif``, ``truth.tif`` and ``meta.json`` with ``disparity``, the search range
-    ``[minimum, maximum]``, and optionally ``group``. A row of a table has left, right, truth, minimum, maximum and
-    optionally name, group, tolerance and remove_bias; see `read_batch` for tables.
-    """
+    """Read pairs with their truth from folders and tables, in their order (docs/coverage.md)."""
     pairs = []
     for path in map(Path, paths):
         pairs += _of_table(path) if path.suffix.lower() in _TABLES else [_of_folder(path)]
@@ -116,14 +111,7 @@ def find_pairs(paths: Iterable[str | Path]) -> list[Pair]:
 
 
 def read_batch(file: Path) -> list[PairOfBatch]:
-    """Read the pairs of a batch from a CSV, YAML or JSON file.
-
-    A row has ``name``, ``left`` and ``right``; ``minimum`` and ``maximum``, the search range; ``left_mask`` and
-    ``right_mask``; ``nodata`` and ``band``, or ``left_nodata`` and so on; ``window``; ``left_model``, ``right_model``,
-    ``left_grid``, ``right_grid`` and ``resolution`` for a surface model, of raw images without grids; and any setting
-    under its dotted name, such as ``sgm.p2``. YAML and JSON hold a list of such rows, in which a setting may also be a
-    section. Paths are relative to the file.
-    """
+    """Read the pairs of a batch from a CSV, YAML or JSON file (docs/clusters.md); paths are relative to the file."""
     pairs = [_of_batch(place, row, file) for place, row in _rows(file, ("name", "left", "right"))]
     check_names((pair.name for pair in pairs), f"{file}: ")
     return pairs

@@ -6,11 +6,11 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from sat_intervals.config.costs import NETWORKS
 from sat_intervals.config.files import read_mapping
 from sat_intervals.config.presets import PRESETS, merged, preset_settings
 from sat_intervals.config.sections import ConfigError
 from sat_intervals.config.settings import Config
-from sat_intervals.config.weights import NETWORKS
 from sat_intervals.config.wording import explained, shown
 
 # Settings that name a file.

@@ -184,11 +184,7 @@ class Config(Section):
 
     @property
     def cuts(self) -> Levels | None:
-        """Return the calibrated levels of sub-pixel cuts in integer costs, and the quantile of the regularisation.
-
-        None without a coverage. Whether a calibration that is given belongs to the settings is checked by
-        `calibrated.resolved`, once a run.
-        """
+        """Return the levels of the calibration, None without a coverage; `calibrated.resolved` checks that it fits."""
         if self.interval is None or self.interval.coverage is None:
             return None
         given = self.interval.calibration

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.config import Config
-from sat_intervals.config.weights import INSTALL_MCCNN
+from sat_intervals.config.costs import INSTALL_MCCNN
 from sat_intervals.errors import ChangedInputError, SatIntervalsError
 from sat_intervals.kernels.correlation import correlate
 from sat_intervals.kernels.cost import Costs, padded_to_lanes, window_state

@@ -20,7 +20,7 @@ from networks import trained_network
 
 from sat_intervals import intervals_of, load_config, match_arrays
 from sat_intervals.config import Config
-from sat_intervals.config.weights import weights_file
+from sat_intervals.config.costs import weights_file
 from sat_intervals.kernels.cost import Codes, between, census
 from sat_intervals.kernels.matching import cost_volume
 from sat_intervals.match.mccnn import load_network
