@@ -211,18 +211,10 @@ def test_config__is_frozen() -> None:
         settings().tiles.size = 64
 
 
-@pytest.mark.parametrize("section", ["sgm", "refinement", "cross_check", "median", "regularization"])
+@pytest.mark.parametrize("section", ["sgm", "refinement", "cross_check", "median", "ambiguity", "interval"])
 def test_load_config__null_switches_a_step_off(section: str) -> None:
-    assert getattr(settings(preset="paper", **{section: None}), section) is None
-
-
-@pytest.mark.parametrize("section", ["ambiguity", "interval"])
-def test_load_config__null_switches_off_what_regularization_does_not_need(section: str) -> None:
-    assert getattr(settings(preset="paper", **{section: None, "regularization": None}), section) is None
-
-
-def test_load_config__takes_explicit_percentiles() -> None:
-    assert settings(ambiguity={"p1": 40, "p99": 812.5}).ambiguity == Ambiguity(p1=40.0, p99=812.5)
+    config = settings(preset="paper", **{section: None, "regularization": None})
+    assert getattr(config, section) is config.regularization is None
 
 
 def test_largest_ambiguity__counts_every_eta_of_every_candidate() -> None:
@@ -237,9 +229,7 @@ REFUSED = [
     ("disparity", {"minimum": 5}, "disparity: minimum 5 is above maximum 0, swap them"),
     ("disparity", {"minimum": -16001}, "disparity.minimum is -16001, allowed: integer >= -16000, <= 16000"),
     ("disparity", {"maximum": "5"}, "disparity.maximum is '5', allowed: integer >= -16000, <= 16000"),
-    ("disparity", {"maximum": True}, "disparity.maximum is true, allowed: integer >= -16000, <= 16000"),
     ("disparity", None, "disparity is null, allowed: section of minimum, maximum, open_ends"),
-    ("cost", None, "cost is null, allowed: section of method, window"),
     ("cost", {"method": "sad"}, "cost.method is 'sad', allowed: census or mccnn"),
     ("cost", {"method": "mccnn", "window": 5}, "unknown key 'cost.window' (known: method, weights)"),
     ("cost", {"method": "mccnn", "weights": 3}, "cost.weights is 3, allowed: text"),
@@ -248,22 +238,13 @@ REFUSED = [
     ("sgm", {"p1": 8.5}, "sgm.p1 is 8.5, allowed: whole numbers with census"),
     ("cost", {"window": 4}, "cost.window is 4, allowed: integer >= 3, <= 11, odd"),
     ("cost", {"windows": 5}, "unknown key 'cost.windows', did you mean window? (known: method, window)"),
-    ("sgm", {"p1": 0}, "sgm.p1 is 0, allowed: number > 0"),
     ("sgm", {"p1": 145}, "sgm: p1 145 is above p2 144, the penalty of a larger step"),
     ("sgm", {"p2": 8144}, "sgm.p2 is 8144, allowed: <= 8143 with cost.window 7, so that costs summed over"),
     ("sgm", [8, 32], "sgm is [8, 32], allowed: section of penalty, p1, p2, span or null"),
-    ("ambiguity", {"eta_max": 0}, "ambiguity.eta_max is 0, allowed: number > 0, <= 1"),
     ("ambiguity", {"eta_max": float("nan")}, "ambiguity.eta_max is NaN, allowed: number > 0, <= 1"),
     ("ambiguity", {"eta_step": 0.0001}, "ambiguity.eta_step is 0.0001, allowed: number >= 0.001, <= 1"),
     ("ambiguity", {"eta_step": 0.8}, "ambiguity: eta_step 0.8 is above eta_max 0.7"),
-    (
-        "ambiguity",
-        {"normalization": "none"},
-        "ambiguity.normalization is 'none', allowed: percentile or range",
-    ),
     ("ambiguity", {"p1": -1, "p99": 9}, "ambiguity.p1 is -1, allowed: number >= 0 or null"),
-    ("ambiguity", {"p1": 1, "p99": float("inf")}, "ambiguity.p99 is inf, allowed: number >= 0 or null"),
-    ("ambiguity", {"p1": 1, "p99": True}, "ambiguity.p99 is true, allowed: number >= 0 or null"),
     ("ambiguity", {"p1": 9}, "ambiguity: p1 is 9.0, p99 is null: give both or none"),
     ("ambiguity", {"p1": 9, "p99": 1}, "ambiguity: p1 9.0 is above p99 1.0, swap them"),
     (
@@ -272,8 +253,6 @@ REFUSED = [
         "ambiguity: p1 and p99 are percentiles: leave them out with normalization range",
     ),
     ("ambiguity", None, "regularization needs ambiguity, set to null: give ambiguity or set"),
-    ("interval", None, "regularization needs interval, set to null: give interval or set"),
-    ("interval", {"alpha": 0}, "interval.alpha is 0, allowed: number > 0, <= 1 or null"),
     ("interval", {"alpha": "0.9"}, "interval.alpha is '0.9', allowed: number > 0, <= 1 or null"),
     (
         "interval",
@@ -281,12 +260,9 @@ REFUSED = [
         "interval: alpha and coverage are null: give one of them, or set interval to null",
     ),
     ("cross_check", {"method": "slow"}, "cross_check.method is 'slow', allowed: fast or accurate"),
-    ("median", {"size": 2}, "median.size is 2, allowed: integer >= 3, <= 11, odd"),
-    ("regularization", {"threshold": 1.5}, "regularization.threshold is 1.5, allowed: number >= 0, <= 1"),
     ("tiles", {"size": 100}, "tiles.size is 100, allowed: integer >= 64, <= 16384, multiple of 64"),
     ("tiles", {"overlap": "none"}, "tiles.overlap is 'none', allowed: integer >= 1, <= 4096 or exact"),
     ("tiles", {"overlap": 2}, "tiles.overlap is 2, allowed: >= 4 with cost.window 7"),
-    ("tiles", None, "tiles is null, allowed: section of size, overlap"),
     ("products", {"keep_rejected": 1}, "products.keep_rejected is 1, allowed: true or false"),
     (
         "regularisation",
@@ -391,11 +367,6 @@ def test_load_config__refuses_other_sources() -> None:
 def test_cost_span__is_the_theoretical_one(window: int, sgm: tuple[int, int] | None, span: int) -> None:
     penalties = None if sgm is None else {"p1": sgm[0], "p2": sgm[1]}
     assert settings(cost={"window": window}, sgm=penalties).cost_span == span
-
-
-def test_ambiguity_levels__are_70_exact_multiples() -> None:
-    config = settings()
-    assert config.ambiguity_levels == tuple(i * 1536 // 100 for i in range(70))
 
 
 @given(st.integers(1, 1000), st.sampled_from([3, 5, 7, 9, 11]), st.integers(1, 600))

@@ -61,13 +61,6 @@ def test_match_costs__interval_worked_example():
     assert upper.tolist() == [[2], [3], [3]]
 
 
-def test_match_costs__ties_belong_to_the_cut():
-    # Alpha .75: (1 - .75) * 24 = 6 above the least belongs, 7 does not.
-    assert of_curves([[3, 9, 20]], 0, alpha="0.75").upper.tolist() == [[1]]
-    assert of_curves([[3, 10, 9]], 0, alpha="0.75").upper.tolist() == [[2]]
-    assert of_curves([[3, 10, 20]], 0, alpha="0.75", refine=False).upper.tolist() == [[0]]
-
-
 def check_against_reference(scene, alpha, refine):
     raw = matched(scene, alpha=alpha, refine=refine)[0]
     bounds = reference.alpha_cut(reference.volume_of(scene), alpha, reference.span_of(scene), refine)
@@ -81,18 +74,6 @@ def check_against_reference(scene, alpha, refine):
 def test_match_costs__interval_equals_reference_at_every_count(count, data):
     scene = data.draw(reference.scenes(counts=(count,), rows=3, columns=6))
     check_against_reference(scene, data.draw(st.sampled_from(ALPHAS)), True)
-
-
-@few
-@given(scene=reference.scenes(), refine=st.booleans(), alpha=st.sampled_from(ALPHAS))
-def test_match_costs__interval_holds_the_disparity(scene, refine, alpha):
-    raw = matched(scene, refine=refine, alpha=alpha)[0]
-    found = raw.winner != N
-    assert (raw.lower[found] <= raw.disparity[found] - scene.minimum).all()
-    assert (raw.disparity[found] - scene.minimum <= raw.upper[found]).all()
-    assert (raw.lower[~found] == NO_BOUND).all()
-    assert (raw.upper[~found] == NO_BOUND).all()
-    assert (raw.upper[found] <= scene.count - 1).all()
 
 
 # ---- Sub-pixel cuts ----------------------------------------------------------------------------------------
@@ -219,18 +200,6 @@ def test_regularize__a_halo_of_depth_rows_is_enough(strip, depth, quantile, data
     np.testing.assert_array_equal(part[1], whole[1][first:last])
 
 
-@few
-@given(strip=strips(), depth=st.integers(0, 3), quantile=quantiles)
-def test_regularize__keeps_order_and_what_is_not_low(strip, depth, quantile):
-    lower, upper, low = strip
-    before = lower.copy(), upper.copy()
-    new_lower, new_upper = regularize(lower, upper, low, MINIMUM, depth, quantile, (0, len(low)), 2)
-    np.testing.assert_array_equal((lower, upper), before)
-    np.testing.assert_array_equal(new_lower[~low], lower[~low])
-    np.testing.assert_array_equal(new_upper[~low], upper[~low])
-    assert (new_lower[low] <= new_upper[low]).all()
-
-
 # ---- The whole method --------------------------------------------------------------------------------------
 @st.composite
 def configs(draw):
@@ -338,10 +307,14 @@ def test_postprocess_rows__of_a_patch_equals_reference(seed, config, holes):
     check(final[:4], final.validity, expected, config)
 
 
-@some
-@given(seed=st.integers(0, 2**32 - 1), config=configs(), holes=st.integers(0, 3))
-def test_match_arrays__equals_reference(seed, config, holes):
+@settings(max_examples=50, derandomize=True, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1), config=configs(), holes=st.integers(0, 3), flat=st.sampled_from(["", "r", "lr", ""])
+)
+def test_match_arrays__equals_reference(seed, config, holes, flat):
     left, right, left_state, right_state = image_pair(seed, config.disparity, holes)
+    for image in {"": (), "r": (right,), "lr": (left, right)}[flat]:
+        image[:, seed % 14 :] = 7  # there texture ends
     left[left_state != 0] = np.nan
     right[right_state != 0] = np.inf
     found = match_arrays(left, right, config)
@@ -356,22 +329,6 @@ def test_match_arrays__equals_reference(seed, config, holes):
     if config.interval is not None:
         assert (lower[shown] <= disparity[shown]).all()
         assert (disparity[shown] <= upper[shown]).all()
-
-
-@some
-@given(seed=st.integers(0, 2**32 - 1), config=configs(), holes=st.integers(0, 3), left_also=st.booleans())
-def test_match_arrays__equals_reference_where_texture_ends(seed, config, holes, left_also):
-    left, right, left_state, right_state = image_pair(seed, config.disparity, holes)
-    first = int(seed % 14)
-    right[:, first:] = 7
-    if left_also:
-        left[:, first:] = 5
-    left[left_state != 0] = np.nan
-    right[right_state != 0] = np.nan
-    found = match_arrays(left, right, config)
-    expected = reference.match_arrays(left, right, left_state * 0, right_state * 0, config)
-    bands = [found[name].values for name in ("disparity", "lower", "upper", "confidence")]
-    check(bands, found["validity"].values, expected, config)
 
 
 @pytest.mark.parametrize("more", [{}, {"sgm": None}, {"cross_check": {"method": "accurate"}}])

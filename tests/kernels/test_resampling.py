@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import reference
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
@@ -9,13 +10,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from sat_intervals.kernels.resampling import reach, resample, resample_reduced
 
 STEP = 4
-
-
-def keys(t):
-    """Keys' kernel with a = -1/2."""
-    t = abs(t)
-    inner, outer = (1.5 * t - 2.5) * t * t + 1, ((-0.5 * t + 2.5) * t - 4) * t + 2
-    return np.where(t <= 1, inner, np.where(t < 2, outer, 0))
 
 
 def positions(nodes, row, column):
@@ -51,7 +45,7 @@ def test_resample__equals_its_slow_twin(seed, scale, turn):
         before, after = reach(scale)
         down = np.arange(int(np.floor(row)) - before, int(np.floor(row)) + after + 1)
         across = np.arange(int(np.floor(column)) - before, int(np.floor(column)) + after + 1)
-        weights = np.outer(keys((row - down) / scale), keys((column - across) / scale))
+        weights = np.outer(reference.cubic((row - down) / scale), reference.cubic((column - across) / scale))
         wanted = (weights * pixels[np.ix_(down, across)]).sum() / weights.sum()
         assert_allclose(found[r, c], wanted, atol=1e-6)
 

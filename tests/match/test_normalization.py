@@ -22,13 +22,6 @@ def test_scale_of__equals_numpy_on_usable_pixels(seed, share, offset):
         assert statistics_of(parts) == pytest.approx(ImageStatistics(usable.mean(), usable.std()), rel=1e-9)
 
 
-def test_scale_of__worked_example():
-    # 1 and 3, then 5, 7 and 9: mean 25 / 5 = 5, squares 16 + 4 + 0 + 4 + 16 = 40, deviation sqrt(8).
-    whole, holes = np.zeros(3, np.uint8), np.array([0, 0, 1], np.uint8)
-    parts = [moments(np.array([1.0, 3.0, 1000.0]), holes), moments(np.array([5.0, 7.0, 9.0]), whole)]
-    assert statistics_of(parts) == (5.0, 8.0**0.5)
-
-
 @pytest.mark.parametrize(("value", "mean"), [(7.0, 7.0), (None, 0.0)])
 def test_scale_of__divides_by_1_where_there_is_no_deviation(value, mean):
     state = np.full(4, value is None, np.uint8)

@@ -171,7 +171,8 @@ def test_match_arrays__refuses_a_range_that_meets_no_right_pixel(minimum, maximu
         SatIntervalsError, match=rf"disparities {minimum} to {maximum} move every pixel .* \(8 columns\)"
     ):
         match_arrays(IMAGE, IMAGE, {"disparity": {"minimum": minimum, "maximum": maximum}})
-    match_arrays(IMAGE, IMAGE, {"disparity": {"minimum": 7, "maximum": 7}})
+    for meets in (7, -7):
+        match_arrays(IMAGE, IMAGE, {"disparity": {"minimum": meets, "maximum": meets}})
 
 
 def test_match_arrays__tells_how_much_memory_a_volume_needs():
