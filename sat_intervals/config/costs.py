@@ -185,8 +185,7 @@ class Volume(_Cost):
     def numbers(self, p2: Fraction | None) -> Numbers:
         """Return the integer costs: a multiple of a whole span, if that fits; an impossible one as with Census.
 
-        ``p2``: the largest penalty of SGM, in units of the values; None without SGM. With it, 8 times the sum of the
-        largest cost and P2 fits in 16 bits.
+        With SGM 8 times the sum of the largest cost and ``p2``, in units of the values, fits in 16 bits.
         """
         span = Fraction(self.span)
         most = _LEVELS if p2 is None else floor(_SGM_LEVELS * span / (span + p2))

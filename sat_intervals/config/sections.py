@@ -44,7 +44,6 @@ Odd = Annotated[int, AfterValidator(check_odd)]
 AbsolutePath = Annotated[str, AfterValidator(absolute)]
 # A number whose thresholds must be exact; a plain number in JSON, so that settings of a run can be read back.
 Exact = Annotated[Decimal, BeforeValidator(as_written), PlainSerializer(as_number, when_used="json")]
-# Disparities are stored as int16; within this limit the difference of any two also fits.
 # The engine and so mypy only see numbers: auto is replaced before a pair is matched, see `Disparity.is_auto`.
 AUTO: Any = "auto"
 # Largest disparity: bounds in steps and sentinels fit in 16 bits.

@@ -10,48 +10,37 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
+from sat_intervals.config import sections
 from sat_intervals.config.calibration import Calibration, Levels, at, built_in
 from sat_intervals.config.costs import SECTIONS, AnyCost, Census, Numbers
 from sat_intervals.config.interval import Interval
 from sat_intervals.config.penalties import AnySgm, Sgm
 from sat_intervals.config.presets import PRESETS, merged, preset_settings
-from sat_intervals.config.sections import (
-    Ambiguity,
-    Cluster,
-    CrossCheck,
-    Disparity,
-    Median,
-    Products,
-    Refinement,
-    Regularization,
-    Section,
-    Tiles,
-)
 from sat_intervals.products import BOUND_STEPS, IMPOSSIBLE_COST, LOG_SPAN
 
 SGM_PATHS = 8
 _CUT = 0.2  # of the span
 
 
-class Config(Section):
+class Config(sections.Section):
     """All settings of a run; None in place of a section switches its step off."""
 
     preset: Literal[PRESETS] = Field(PRESETS[0], description="settings for all keys that are not given")  # type: ignore[valid-type]
-    disparity: Disparity = Disparity()
+    disparity: sections.Disparity = sections.Disparity()
     rows: Literal["auto", "none"] = Field(
         "auto", description="row offsets of the right image: measured and taken out, or left"
     )
     cost: AnyCost = Census()
     sgm: AnySgm | None = Sgm()
-    ambiguity: Ambiguity | None = Ambiguity()
+    ambiguity: sections.Ambiguity | None = sections.Ambiguity()
     interval: Interval | None = Interval()
-    refinement: Refinement | None = Refinement()
-    cross_check: CrossCheck | None = CrossCheck()
-    median: Median | None = Median()
-    regularization: Regularization | None = Regularization()
-    tiles: Tiles = Tiles()
-    products: Products = Products()
-    cluster: Cluster = Cluster()
+    refinement: sections.Refinement | None = sections.Refinement()
+    cross_check: sections.CrossCheck | None = sections.CrossCheck()
+    median: sections.Median | None = sections.Median()
+    regularization: sections.Regularization | None = sections.Regularization()
+    tiles: sections.Tiles = sections.Tiles()
+    products: sections.Products = sections.Products()
+    cluster: sections.Cluster = sections.Cluster()
 
     @model_validator(mode="before")
     @classmethod
@@ -255,15 +244,15 @@ def key_of(config: Config) -> dict[str, Any]:
 
     Neither the search range nor alpha nor the quantile of the regularisation is among them.
     """
-    sections = config.model_dump(mode="json")
-    sgm, ambiguity, low = (sections[name] for name in ("sgm", "ambiguity", "regularization"))
+    dumped = config.model_dump(mode="json")
+    sgm, ambiguity, low = (dumped[name] for name in ("sgm", "ambiguity", "regularization"))
     return {
         "cost": config.cost.key(),
         "sgm": sgm and {name: value for name, value in sgm.items() if value is not None},
         "span": config.cost_span,
         "ambiguity": ambiguity and {name: ambiguity[name] for name in ("eta_max", "eta_step", "normalization")},
-        "refinement": sections["refinement"],
-        "cross_check": sections["cross_check"],
-        "median": sections["median"],
+        "refinement": dumped["refinement"],
+        "cross_check": dumped["cross_check"],
+        "median": dumped["median"],
         "confidence": low and {name: low[name] for name in ("threshold", "kernel", "depth")},
     }

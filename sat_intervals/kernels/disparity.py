@@ -148,11 +148,8 @@ def _median_3(values, kept):
             near_kept[entering] = False
         if r >= 0:
             above, here = (r - 1) % 3, r % 3
-            _medians_of_nine(
-                (near[above], near[here], near[entering]),
-                (near_kept[above], near_kept[here], near_kept[entering]),
-                result[r],
-            )
+            of_kept = near_kept[above], near_kept[here], near_kept[entering]
+            _medians_of_nine((near[above], near[here], near[entering]), of_kept, result[r])
     return result
 
 

@@ -61,7 +61,7 @@ class Matched(NamedTuple):
 def _sweep(costs, gradients, settings, output, core, keep, borders, cells):
     """Run both sweeps; return what they match and the volume (finished curves only with ``keep``)."""
     size = padded_to_lanes(settings.count)
-    buffers = new_buffers(costs, gradients, settings, borders, cells)
+    buffers = new_buffers(costs, gradients, settings, borders, cells, True)
     shape = output.height, output.width
     # Allocated for each tile: a buffer kept between tiles (4 % faster) can pause a dask worker above its memory limit.
     starts = volume_starts(buffers.cells, output)
@@ -84,7 +84,7 @@ def _sweep(costs, gradients, settings, output, core, keep, borders, cells):
     right = RightPixels(cores, np.arange(size, dtype=np.uint16), cost, np.zeros(cost.shape, np.uint16))
     if settings.regularized:
         sweep_down(buffers, gradients, settings, wanted, volume)
-        buffers = new_buffers(costs, gradients, settings, borders, cells, down=False)
+        buffers = new_buffers(costs, gradients, settings, borders, cells, False)
     sweep_up(buffers, gradients, settings, wanted, volume, raw, right, keep)
     cost = cost[:, : core.width + settings.count - 1]
     winner = right.best[:, : cost.shape[1]].astype(np.int16) + np.int16(settings.minimum)
@@ -93,12 +93,7 @@ def _sweep(costs, gradients, settings, output, core, keep, borders, cells):
 
 
 def trace(
-    costs: Costs,
-    settings: Settings,
-    borders: Borders,
-    wavefront: int,
-    gradients: Gradients | None = None,
-    cells: Cells | None = None,
+    costs: Costs, settings: Settings, borders: Borders, wavefront: int, gradients: Gradients | None, cells: Cells | None
 ) -> Edge:
     """Path states of one of WAVEFRONTS where it leaves ``borders.inside``; parameters as in `match_costs`."""
     down, wave = WAVEFRONTS[wavefront]

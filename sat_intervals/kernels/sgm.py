@@ -11,21 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sat_intervals.kernels import vector
 from sat_intervals.kernels.compiled import inlined, part
 from sat_intervals.kernels.cost import candidate_costs
 from sat_intervals.kernels.penalties import penalties_of
-from sat_intervals.kernels.vector import (
-    LANES,
-    add,
-    load,
-    slide_down,
-    slide_up,
-    smaller,
-    smallest,
-    splat,
-    store,
-    subtract,
-)
+from sat_intervals.kernels.vector import LANES
 from sat_intervals.tiling import Window
 
 # Above every L of a candidate: an impossible one is at most 2 P2 + 2 plus twice the largest cost, < 16505.
@@ -67,8 +57,9 @@ def _begin(paths, slot, first):
     Returns the start of its curve, ``min L(q)``, L(q) of two blocks, and the least L so far.
     """
     start = slot * paths.curves.shape[1]
-    before = load(paths.curves, start + first - LANES) if first > 0 else splat(np.uint16(WALL))
-    return start, splat(paths.lowest[slot]), before, load(paths.curves, start + first), splat(np.uint16(65535))
+    before = vector.load(paths.curves, start + first - LANES) if first > 0 else vector.splat(np.uint16(WALL))
+    here = vector.load(paths.curves, start + first)
+    return start, vector.splat(paths.lowest[slot]), before, here, vector.splat(np.uint16(65535))
 
 
 @inlined
@@ -76,12 +67,12 @@ def _wall_up(curves, spans, span, slots):
     """Set walls where earlier pixels of the paths in ``slots`` have searched and this one does not."""
     if spans is None:
         return
-    wall, size = splat(np.uint16(WALL)), curves.shape[1]
+    wall, size = vector.splat(np.uint16(WALL)), curves.shape[1]
     for slot in slots:
         for k in range(spans[slot, 0], span.start, LANES):
-            store(curves, slot * size + k, wall)
+            vector.store(curves, slot * size + k, wall)
         for k in range(span.stop, spans[slot, 1], LANES):
-            store(curves, slot * size + k, wall)
+            vector.store(curves, slot * size + k, wall)
         spans[slot, 0], spans[slot, 1] = span.start, span.stop
 
 
@@ -90,10 +81,11 @@ def _advance(path, curves, k, costs, penalties):
     """Apply the recurrence to the candidates ``k .. k + 31`` of a path; return its next state and their L."""
     start, lowest, before, here, minimum = path
     p1, p2 = penalties
-    after = load(curves, start + k + LANES) if k + LANES < curves.shape[1] else splat(np.uint16(WALL))
-    best = smaller(here, add(smaller(slide_up(before, here), slide_down(here, after)), p1))
-    best = add(costs, subtract(smaller(best, add(lowest, p2)), lowest))
-    return (start, lowest, here, after, smaller(minimum, best)), best
+    after = vector.load(curves, start + k + LANES) if k + LANES < curves.shape[1] else vector.splat(np.uint16(WALL))
+    beside = vector.smaller(vector.slide_up(before, here), vector.slide_down(here, after))
+    best = vector.smaller(here, vector.add(beside, p1))
+    best = vector.add(costs, vector.subtract(vector.smaller(best, vector.add(lowest, p2)), lowest))
+    return (start, lowest, here, after, vector.smaller(minimum, best)), best
 
 
 @inlined
@@ -117,13 +109,14 @@ def advance_pixel(candidates, span, penalties, paths, slots, r, c, target):
         path_3, cost_3 = _advance(path_3, curves, k, costs, penalties_of(p1, p2, row, 2, c, k))
         path_4, cost_4 = _advance(path_4, curves, k, costs, penalties_of(p1, p2, row, 3, c, k))
         # All stores after all loads: in `_advance` they would make sweeps 4 % slower.
-        store(curves, path_1[0] + k, cost_1)
-        store(curves, path_2[0] + k, cost_2)
-        store(curves, path_3[0] + k, cost_3)
-        store(curves, path_4[0] + k, cost_4)
-        store(array, offset + k, add(add(cost_1, cost_2), add(cost_3, cost_4)))
-    lowest[slots[0]], lowest[slots[1]] = smallest(path_1[4]), smallest(path_2[4])
-    lowest[slots[2]], lowest[slots[3]] = smallest(path_3[4]), smallest(path_4[4])
+        vector.store(curves, path_1[0] + k, cost_1)
+        vector.store(curves, path_2[0] + k, cost_2)
+        vector.store(curves, path_3[0] + k, cost_3)
+        vector.store(curves, path_4[0] + k, cost_4)
+        total = vector.add(vector.add(cost_1, cost_2), vector.add(cost_3, cost_4))
+        vector.store(array, offset + k, total)
+    lowest[slots[0]], lowest[slots[1]] = vector.smallest(path_1[4]), vector.smallest(path_2[4])
+    lowest[slots[2]], lowest[slots[3]] = vector.smallest(path_3[4]), vector.smallest(path_4[4])
     _wall_up(curves, spans, span, slots)
 
 
@@ -138,9 +131,9 @@ def advance_wave(candidates, span, penalties, paths, slots, wave, r, c):
         costs = candidate_costs(candidates, r, c, k)
         path_1, cost_1 = _advance(path_1, curves, k, costs, penalties_of(p1, p2, row, i, c, k))
         path_2, cost_2 = _advance(path_2, curves, k, costs, penalties_of(p1, p2, row, i + 1, c, k))
-        store(curves, path_1[0] + k, cost_1)
-        store(curves, path_2[0] + k, cost_2)
-    lowest[pair[0]], lowest[pair[1]] = smallest(path_1[4]), smallest(path_2[4])
+        vector.store(curves, path_1[0] + k, cost_1)
+        vector.store(curves, path_2[0] + k, cost_2)
+    lowest[pair[0]], lowest[pair[1]] = vector.smallest(path_1[4]), vector.smallest(path_2[4])
     _wall_up(curves, spans, span, pair)
 
 
@@ -174,14 +167,14 @@ def restart(paths, slots):
 def add_curve(curve, span, volume, offset):
     """Add the sums of the candidates of a pixel, of which candidate k is ``volume[offset + k]``, to its curve."""
     for k in range(span.start, span.stop, LANES):
-        store(curve, k, add(load(curve, k), load(volume, offset + k)))
+        vector.store(curve, k, vector.add(vector.load(curve, k), vector.load(volume, offset + k)))
 
 
 @inlined
 def keep_curve(curve, span, volume, offset):
     """Copy the candidates of a pixel to where `add_curve` reads them."""
     for k in range(span.start, span.stop, LANES):
-        store(volume, offset + k, load(curve, k))
+        vector.store(volume, offset + k, vector.load(curve, k))
 
 
 @inlined

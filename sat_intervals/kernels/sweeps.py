@@ -107,9 +107,9 @@ def new_buffers(
     settings: Settings,
     borders: Borders | None,
     cells: Cells | None,
-    down: bool = True,
+    down: bool,
 ) -> Buffers:
-    """Allocate the buffers of a sweep; parameters as in `match_costs`."""
+    """Allocate the buffers of a sweep ``down`` or up; other parameters as in `match_costs`."""
     (rows, columns), size = costs.left_state.shape, padded_to_lanes(settings.count)
     left = borders.inside if borders else Window(0, 0, 0, 0)
     nothing = np.zeros((0, 2, size), np.uint16)

@@ -82,12 +82,7 @@ def borders_of(frame: PatchFrame, config: Config, found: Sequence[Mapping[Place,
 
 
 def trace_area(
-    cost: AreaCosts,
-    frame: PatchFrame,
-    borders: Borders,
-    wavefront: int,
-    config: Config,
-    ranges: LocalRanges | None = None,
+    cost: AreaCosts, frame: PatchFrame, borders: Borders, wavefront: int, config: Config, ranges: LocalRanges | None
 ) -> Edge:
     """Path states that a tile hands on in a wavefront, from the costs of its `frame_area` and its `borders_of`."""
     settings, cells = patch_settings(frame_area(frame, config).base, config, ranges)

@@ -52,9 +52,9 @@ class ExternalVolume:
 
     @property
     def first_index(self) -> int:
-        """Return the first disparity as the kernels count candidates; 0 if they are no whole pixels."""
-        first = self.first / self.step if self.step == 1 else 0.5  # a search range is in pixels
-        return round(first) if abs(first - round(first)) < _TOLERANCE else 0
+        """Return the first disparity as the kernels count candidates; 0 if they are no whole pixels, as a range is."""
+        is_whole = self.step == 1 and abs(self.first - round(self.first)) < _TOLERANCE
+        return round(self.first) if is_whole else 0
 
     @property
     def whole_pixels(self) -> tuple[int, int]:

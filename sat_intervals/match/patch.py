@@ -22,8 +22,7 @@ _SHORT = 8
 class PatchFrame(NamedTuple):
     """A core and what surrounds it in its view.
 
-    core: pixels whose products are kept.
-    region: pixels of the whole run.
+    core, region: pixels whose products are kept, and those of the whole run.
     whole: all pixels of the left image; in the right view, all pixels that face them.
     mirrored: whether this is the right view.
     """
@@ -163,20 +162,13 @@ def match_patch(
     settings, cells = patch_settings(area.base, config, ranges)
     wants_fast = config.cross_check is not None and not config.matches_right_view
     right_core = core if wants_fast else Window(core.row, core.column, 0, 0)
-    raw, right, *leaving = match_costs(
-        cost.costs,
-        settings,
-        output.relative_to(area.base),
-        right_core.relative_to(area.base),
-        cost.gradients,
-        borders[0] if borders else None,
-        cells,
-    )
+    wanted, cores = output.relative_to(area.base), right_core.relative_to(area.base)
+    of_left = borders[0] if borders else None
+    raw, right, *leaving = match_costs(cost.costs, settings, wanted, cores, cost.gradients, of_left, cells)
     if ranges:
         right = _of_whole_range(right, right_core, settings)
-    inside = output.relative_to(area.base).slices
-    raw.validity[cost.state[inside] & MASKED != 0] |= LEFT_MASKED
-    flat = textureless(cost, area, config, cells)[inside]
+    raw.validity[cost.state[wanted.slices] & MASKED != 0] |= LEFT_MASKED
+    flat = textureless(cost, area, config, cells)[wanted.slices]
     _mark_ambiguous(raw, flat, config)
     _mark_ends(raw, flat, config.disparity)
     if ranges:

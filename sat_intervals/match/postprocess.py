@@ -1,8 +1,7 @@
-"""Whole-image steps on raw products: cross-checking, confidence, medians, regularisation, final bands.
+"""Whole-image steps on raw products: cross-checking, confidence, medians, least squares, regularisation, widening.
 
 All steps work on full-width rows with a halo of rows above and below, so that results do not depend on the tiling
-(METHOD.md, sections 4, 6 to 9, and 19). The order is: winner and V-fit (in the tile), cross-check, median, least
-squares, quantiles, widening, NaN for invalid pixels.
+(METHOD.md, sections 4, 6 to 9, and 19).
 """
 
 from collections.abc import Iterable, Iterator
@@ -187,17 +186,14 @@ def _bounds(rows: RawRows, low: np.ndarray | None, kept: np.ndarray, config: Con
     if config.interval is None:
         nothing = np.full(rows.lower.shape, np.float32(np.nan))
         return nothing, nothing
-    lower, upper = rows.lower, rows.upper
+    high, both = (rows.lower, rows.upper), ((rows.lower_low, rows.lower), (rows.upper_low, rows.upper))
     if low is None or not config.has_coverage:
-        return _filtered(lower, kept, config), _filtered(upper, kept, config)
-    if config.fits:
-        lower, upper = (
-            np.where(low, _filtered(of_low, kept, config), _filtered(of_high, kept, config))
-            for of_low, of_high in ((rows.lower_low, lower), (rows.upper_low, upper))
-        )
-        return lower, upper
-    lower, upper = np.where(low, rows.lower_low, lower), np.where(low, rows.upper_low, upper)
-    return _filtered(lower, kept, config), _filtered(upper, kept, config)
+        lower, upper = (_filtered(bound, kept, config) for bound in high)
+    elif config.fits:
+        lower, upper = (np.where(low, *(_filtered(bound, kept, config) for bound in pair)) for pair in both)
+    else:
+        lower, upper = (_filtered(np.where(low, *pair), kept, config) for pair in both)
+    return lower, upper
 
 
 def _filtered(bound: np.ndarray, kept: np.ndarray, config: Config) -> np.ndarray:

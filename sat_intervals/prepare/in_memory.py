@@ -101,9 +101,8 @@ def _matched(left: Array, right: Array, config: Config, given: np.ndarray | None
     labels = left if isinstance(left, xr.DataArray) else xr.DataArray(images[0], dims=("y", "x"))
     if given is not None:
         final = with_agreement(final, given)
-    attributes = {"preset": config.preset} if config.preset else {}
     rows = {"rows": as_json(asdict(prepared.rows), indent=None)} if prepared.rows else {}
-    return labelled(final, labels, attributes | rows)
+    return labelled(final, labels, {"preset": config.preset} | rows)
 
 
 def _pixels(array: Array, side: str) -> np.ma.MaskedArray:
