@@ -156,8 +156,7 @@ def read_profile(given: Comparison, line: tuple[float, float, float, float] | No
 
     ``line`` is easting and northing of both ends, in the surface's CRS.
     """
-    place = given.place.transform
-    assert place is not None
+    place = given.place.affine
     rows, columns = given.shape
     if line is None:
         y = place.f + (rows // 2 + 0.5) * place.e
@@ -193,7 +192,6 @@ def error_map(given: Comparison, longest: int) -> tuple[np.ndarray, tuple[float,
     small = -(-rows // coarser), -(-columns // coarser)
     heights = read_small_layers(given.surface, small)[0].astype(np.float64)
     truth = given.heights(given.place.coarser(columns / small[1], rows / small[0]), small)
-    place = given.place.transform
-    assert place is not None
+    place = given.place.affine
     extent = place.c, place.c + columns * place.a, place.f + rows * place.e, place.f
     return heights - truth, extent

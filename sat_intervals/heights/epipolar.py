@@ -213,10 +213,7 @@ def _footprint(left: SensorImage, nodes: np.ndarray, shape: tuple[int, int], hei
 
 
 def _dem(left: SensorImage, right: SensorImage, nodes: np.ndarray, terrain: Terrain, height: float) -> Any:
-    """Return the DEM around the left nodes as shareloc reads it, or its only height; raise if it does not cover them.
-
-    shareloc goes from node to node, also where they are far from the overlap.
-    """
+    """Return the DEM around all left nodes, which shareloc follows, or its only height; raise if it is smaller."""
     dem, geoid = str(terrain.dem), terrain.geoid and str(terrain.geoid)
     ground = left.model.direct_loc_h(*nodes[:: len(nodes) - 1].reshape(-1, 2).T, height)[:, :2]
     heights, place = ground_of(Path(dem), (*ground.min(axis=0), *ground.max(axis=0)), _AROUND)

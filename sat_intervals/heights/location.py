@@ -4,15 +4,11 @@ import warnings
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import RegularGridInterpolator
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.sensors import Sensors
 from sat_intervals.raster import Projection, between_180
-
-try:
-    from scipy.interpolate import RegularGridInterpolator
-except ModuleNotFoundError as error:
-    raise SatIntervalsError("reference heights need shareloc: pip install 'sat-intervals[dsm]'") from error
 
 # Largest error of the inverse of a grid in sensor pixels, and iterations: a grid is affine but for a thousandth.
 _NEAR, _MOST = 1e-6, 30
@@ -25,10 +21,8 @@ class Location:
 
     def __init__(self, sensors: Sensors) -> None:
         self._turn = sensors.turn
-        self._views = (
-            (sensors.left_model, _Inverse(sensors.left_grid)),
-            (sensors.right_model, _Inverse(sensors.right_grid)),
-        )
+        grids = _Inverse(sensors.left_grid), _Inverse(sensors.right_grid)
+        self._views = list(zip((sensors.left_model, sensors.right_model), grids, strict=True))
 
     def positions(self, longitude: np.ndarray, latitude: np.ndarray, height: np.ndarray) -> np.ndarray:
         """Return ``(n, 4)`` row and column in the left, then in the right image, NaN where none, of points ``(n,)``.

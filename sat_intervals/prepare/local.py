@@ -20,7 +20,7 @@ from sat_intervals.raster import (
     read_window,
 )
 from sat_intervals.raster.identity import identity
-from sat_intervals.raster.published import tag_of_left, tags_beside
+from sat_intervals.raster.layers import tag_of_left, tags_beside
 from sat_intervals.tiling import Window
 
 # Rows that are written at a time.

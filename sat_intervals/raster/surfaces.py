@@ -25,17 +25,16 @@ Bounds = tuple[float, float, float, float]
 _DATUM = 10.0
 
 
-def is_surface(path: Path) -> bool:
-    """Return whether a file has the bands of a surface model."""
-    try:
-        with opened(str(path)) as dataset:
-            return bool(dataset.descriptions == tuple(band.name for band in SURFACE))
-    except SatIntervalsError:
-        return False
+def surface_place(path: Path) -> tuple[tuple[int, int], Georeferencing]:
+    """Return what `read_place` does; raise if a file has not the bands of a surface model."""
+    with opened(str(path)) as dataset:
+        if dataset.descriptions != tuple(band.name for band in SURFACE):
+            raise SatIntervalsError(f"{path} is not a surface model of sat-intervals dsm: give one, or make it again")
+    return read_place(path)
 
 
 def read_place(path: Path) -> tuple[tuple[int, int], Georeferencing]:
-    """Return rows and columns of a surface model, and its georeferencing, which must be north up."""
+    """Return rows and columns of a raster, and its georeferencing, which must be north up."""
     with opened(str(path)) as dataset:
         place = Georeferencing.of(dataset)
         if place.crs is None or place.transform is None or place.transform.b or place.transform.d:
@@ -51,9 +50,7 @@ def check_reference(path: Path, surface: Path) -> None:
         level = dataset.tags().get("HEIGHTS", "")
     parts = crs.sub_crs_list if crs.is_compound else [crs]
     if not (parts[0].is_geographic or parts[0].is_projected):
-        raise SatIntervalsError(
-            f"the CRS of {path}, {crs.name}, is a local one: give a reference with a CRS of the Earth"
-        )
+        raise SatIntervalsError(f"the CRS of {path}, {crs.name}, is a local one: give a reference on the Earth")
     if len(crs.axis_info) > 2 and crs.axis_info[2].unit_conversion_factor != 1:
         unit = crs.axis_info[2].unit_name
     if unit:
@@ -88,8 +85,7 @@ def resolution_of(path: Path, place: Georeferencing) -> float:
 
 def covered_window(path: Path, place: Georeferencing, shape: tuple[int, int]) -> Window:
     """Return the part of a north-up grid of cells that the extent of a raster covers; all cells if it is unknown."""
-    whole, grid = Window(0, 0, *shape), place.transform
-    assert grid is not None
+    whole, grid = Window(0, 0, *shape), place.affine
     with opened(str(path)) as dataset:
         given = dataset.bounds
         cells = transform_bounds(place.crs, dataset.crs, *array_bounds(*shape, grid))
@@ -168,8 +164,7 @@ def ground_of(path: Path, bounds: Bounds, around: float) -> tuple[np.ndarray, Ge
 
 def _cells(place: Georeferencing, bounds: Bounds) -> Window:
     """Return the cells of a raster, north or south up, around bounds in degrees."""
-    assert place.transform is not None
-    a, _, c, _, e, f = place.transform[:6]
+    a, _, c, _, e, f = place.affine[:6]
     left, bottom, right, top = transform_bounds("EPSG:4326", place.crs, *bounds)
     rows, columns = sorted(((bottom - f) / e, (top - f) / e)), sorted(((left - c) / a, (right - c) / a))
     return Window.around(*zip(rows, columns, strict=True))

@@ -14,15 +14,9 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import BANDS, SURFACE
-from sat_intervals.raster import (
-    Georeferencing,
-    open_image,
-    read_layers,
-    read_place,
-    read_small_image,
-    read_small_layers,
-)
+from sat_intervals.raster import Georeferencing, open_image, read_layers, read_place, read_small_layers
 from sat_intervals.raster.publishing import write_file
+from sat_intervals.raster.windows import read_small_image
 from sat_intervals.results import Run, open_input, open_run
 from sat_intervals.show import styles
 from sat_intervals.tiling import Window

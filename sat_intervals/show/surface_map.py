@@ -4,9 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import SURFACE
-from sat_intervals.raster import is_surface, read_place, read_small_layers, read_tags
+from sat_intervals.raster import read_small_layers, read_tags, surface_place
 from sat_intervals.show.canvas import (
     DPI,
     GROUND,
@@ -33,19 +32,15 @@ _MOST, _TIMES = 98, 12
 
 def draw_surface(surface: Path, target: Path, dpi: int = DPI) -> None:
     """Draw hillshade, height, interval width and confidence, or agreement of runs, from the overviews."""
-    shape, place = read_place(surface)
-    if not is_surface(surface):
-        raise SatIntervalsError(f"{surface} is not a surface model of sat-intervals dsm: move it or make it again")
+    shape, place = surface_place(surface)
     assert place.crs is not None
-    assert place.transform is not None
-    assert place.pixel_size is not None
     inches = map_size(shape, _LONGEST)
     drawn = fitting(shape, inches, dpi)
     bands = dict(zip((band.name for band in SURFACE), read_small_layers(surface, drawn), strict=True))
     height = bands["height"].astype(np.float64)
     halves = (bands["height_upper"] - bands["height_lower"]) / 2
     across, down = place.pixel_size[0] * shape[1] / drawn[1], place.pixel_size[1] * shape[0] / drawn[0]
-    left, top = place.transform.c, place.transform.f
+    left, top = place.affine.c, place.affine.f
     ends = left + shape[1] * place.pixel_size[0], top - shape[0] * place.pixel_size[1]
     frame = PlotFrame(left, *ends, top, GROUND)
     middle, end = _middle_and_end(halves)

@@ -7,8 +7,8 @@ from pyproj import Transformer
 from rasterio.transform import Affine
 from surfaces import PLACE, write_raster
 
-from sat_intervals.raster import Georeferencing, covered_window
-from sat_intervals.raster.surfaces import read_heights
+from sat_intervals.raster import Georeferencing
+from sat_intervals.raster.surfaces import covered_window, read_heights
 from sat_intervals.tiling import Window
 
 GRID = Georeferencing(crs="EPSG:32631", transform=PLACE)

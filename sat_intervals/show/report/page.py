@@ -68,7 +68,6 @@ def _surface(results: Results) -> dict[str, Any] | None:
     if not results.has_current("dsm.tif"):
         return None
     (rows, columns), place = read_place(results.out / "dsm.tif")
-    assert place.pixel_size is not None
     small = -(-rows // max(1, rows // _CELLS)), -(-columns // max(1, columns // _CELLS))
     height, lower, upper = read_small_layers(results.out / "dsm.tif", small)[:3].astype(np.float64)
     known, halves = np.isfinite(height), (upper - lower)[np.isfinite(lower)] / 2
