@@ -18,8 +18,7 @@ from sat_intervals.results import Results
 from sat_intervals.show.legend import PIXEL_CLASSES, class_counts
 from sat_intervals.show.report.contents import Histograms, Pixels
 
-# Rows and columns of a surface that are read.
-_CELLS = 1000
+_CELLS = 1000  # rows and columns of a surface that are read
 
 
 def write_report(results: Results) -> Path:
