@@ -16,25 +16,21 @@ from sat_intervals.raster.heightfield import warn_of_no_data
 from sat_intervals.raster.surfaces import check_reference, covered_window, datum_warnings, resolution_of
 from sat_intervals.tiling import Grid, Window
 
-# Heights compared at a time, some hundred bytes each.
-_TILE = 1 << 20
+_TILE = 1 << 20  # heights compared at a time, some hundred bytes each
 # Smallest side of the blocks that register, in cells; cells around a window that slopes are taken from.
 _SMALLEST, _AROUND = 16, 4
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A surface model and its reference, moved by the shift of ``registration``, see `Registration.report`.
-
-    ``resolution`` is the size of the reference's pixels in metres, ``finer`` the number of its heights along a cell.
-    """
+    """A surface model and its reference, moved by the shift of ``registration``, see `Registration.report`."""
 
     surface: Path
     reference: Path
     shape: tuple[int, int]
     place: Georeferencing
-    resolution: float
-    finer: int
+    resolution: float  # of the reference in metres
+    finer: int  # heights of the reference along a cell
     registration: dict[str, Any] | None = None
 
     @property

@@ -21,12 +21,9 @@ from sat_intervals.raster.georeferencing import horizontal_name
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
 
-# More cells per pixel mean a wrong resolution or runs of different places.
-_CELLS_PER_PIXEL = 1000
-# Largest radius in cells: the work grows with its square.
-_REACH = 32
-# Metres: largest cell and largest radius.
-_LARGEST = 10_000.0
+_CELLS_PER_PIXEL = 1000  # more cells per pixel mean a wrong resolution or runs of different places
+_REACH = 32  # largest radius in cells: the work grows with its square
+_LARGEST = 10_000.0  # metres: largest cell and largest radius
 
 
 def make_surface(

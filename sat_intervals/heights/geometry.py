@@ -23,8 +23,7 @@ FILE = "geometry.json"
 _KINDS = "left_model", "right_model", "left_grid", "right_grid"
 _GIVE = "give left and right models and grids, for each OUT (--left-model, ...; in Python set_geometry)"
 
-# Metres between lines of sight above which models are suspect.
-SUSPECT = 0.1
+SUSPECT = 0.1  # metres between lines of sight above which models are suspect
 # Nodes of a grid beyond the image above which it may be that of another image: CARS adds up to three.
 _MOST_BEYOND = 4
 

@@ -66,10 +66,9 @@ class _Inverse:
 
 
 class GroundLattice:
-    """Interpolate the positions of ground points in both images between the nodes of a lattice on the map.
+    """Positions of ground points, interpolated between nodes on the map: exact ones take a minute for a million points.
 
-    ``lowest`` and ``highest`` are corners of a box: easting, northing, ellipsoidal height in metres, the unit of
-    ``pixel``, too. shareloc and the inverse of the grids need a minute for a million points.
+    ``lowest`` and ``highest`` are corners of a box: easting, northing, ellipsoidal height; metres, as ``pixel``.
     """
 
     def __init__(

@@ -57,11 +57,7 @@ def make_pair(
     compare: Compare | None = None,
     progress: Progress = lambda stage, done, total: None,
 ) -> dict[str, Any]:
-    """Write ``left.tif``, ``right.tif``, ``left_grid.tif``, ``right_grid.tif`` and ``rectify.json`` to a folder.
-
-    Returns the content of ``rectify.json``. What the folder has of the same inputs and settings is kept; rows are
-    compared if they were not.
-    """
+    """Write images, grids and record of a pair to a folder, unless it has them, and return the record."""
     from sat_intervals.heights.models import SensorImage
 
     pair.terrain.check()
@@ -81,11 +77,7 @@ def make_pair(
 
 
 def _make(
-    pair: RawPair,
-    readings: "Sequence[Sequence[SensorImage]]",
-    out: Path,
-    asked: dict[str, Any],
-    progress: Progress,
+    pair: RawPair, readings: "Sequence[Sequence[SensorImage]]", out: Path, asked: dict[str, Any], progress: Progress
 ) -> dict[str, Any]:
     """Write all files; return the record."""
     from sat_intervals.heights.epipolar import epipolar_geometry, grid_place
@@ -113,9 +105,7 @@ def _make(
         _note(out, asked | {"finished": None})
         images.publish()
         grids.publish()
-    record = asked | geometry.figures
-    record["bounds"] = "the upper bound of the disparity is the lower height"
-    record["rows"] = None
+    record = asked | geometry.figures | {"bounds": "the upper bound of the disparity is the lower height", "rows": None}
     record["finished"] = datetime.now(UTC).isoformat(timespec="seconds")
     _note(out, record)
     return record

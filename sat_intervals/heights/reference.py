@@ -27,12 +27,9 @@ from sat_intervals.raster.layers import tag_of_left
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
 
-# Points to register with, chosen at random.
-_SAMPLE = 100_000
-# Metres around the region's ground in which points are read.
-_AROUND = 500.0
-# Positions along both axes of a region at which the row misfit is measured.
-_CHECKED = 9
+_SAMPLE = 100_000  # points to register with, chosen at random
+_AROUND = 500.0  # metres around the region's ground in which points are read
+_CHECKED = 9  # positions along both axes of a region at which the row misfit is measured
 # Correlation of disparities and truth below which left and right are swapped, and pixels that it takes.
 _SWAPPED, _ENOUGH = -0.5, 500
 

@@ -21,21 +21,17 @@ from sat_intervals.raster import GROUND, Georeferencing, between_180, read_known
 from sat_intervals.tiling import Window
 
 with kernels_of_others():
+    from affine import Affine
     from shareloc.geofunctions.rectification_grid import RectificationGrid
     from shareloc.geofunctions.triangulation import epipolar_triangulation
 
-# Pixels between nodes of the lattice: interpolation errors are below 1 mm.
-_SPACING = 32
-# Nodes triangulated at a time, a kilobyte each.
-_AT_ONCE = 100_000
-# Positions along rows and columns of a region, to check models and grids.
-_CHECKED = 9
-# Degrees of longitude from the 180th meridian: models nearer to it are turned.
-_NEAR_180 = 2.0
+_SPACING = 32  # pixels between nodes of the lattice: interpolation errors are below 1 mm
+_AT_ONCE = 100_000  # nodes triangulated at a time, a kilobyte each
+_CHECKED = 9  # positions along rows and columns of a region, to check models and grids
+_NEAR_180 = 2.0  # degrees of longitude from the 180th meridian: models nearer to it are turned
 # Metres: lines of sight of one scene meet within centimetres, those of two scenes miss by hundreds of metres.
 _LARGEST_RESIDUAL = 10.0
-# OTB 8 tags every raster that it writes with this.
-_TAG, _OTB = "METADATATYPE", "OTB"
+_TAG, _OTB = "METADATATYPE", "OTB"  # OTB 8 tags every raster that it writes with this
 # Sensor pixels per epipolar pixel, along and across: one at full resolution, more for reduced images.
 _SCALES = 0.4, 40.0
 
@@ -91,10 +87,7 @@ class Sensors:
 
 
 def _turned(models: Sequence[Any]) -> float:
-    """Turn models near the 180th meridian to longitude 0 and return by how much: shareloc has longitudes up to 180.
-
-    Turning about the Earth's axis changes neither heights nor distances.
-    """
+    """Turn models near the 180th meridian, where shareloc ends, about the Earth's axis to longitude 0; return it."""
     turn = float(models[0].offset_x)
     if 180 - abs(turn) > _NEAR_180:
         return 0.0
@@ -104,11 +97,10 @@ def _turned(models: Sequence[Any]) -> float:
 
 
 def read_grid(path: Path, left: Georeferencing) -> RectificationGrid:
-    """Read a grid as sensor positions at epipolar positions; pixel centres of the left epipolar image are integers.
+    """Read a grid, columns in band 1, rows in band 2, as sensor positions at epipolar ones: pixel centres are integers.
 
-    Columns are in band 1, rows in band 2; no data means no position. Grids of OTB have displacements from epipolar
-    coordinates, which are the positions of pixels in the georeferencing ``left`` of the whole left epipolar image, also
-    for the right one.
+    Grids of OTB have displacements from epipolar coordinates, for both images those of pixels in the georeferencing
+    ``left`` of the whole left epipolar image.
     """
     grid = RectificationGrid(str(path))
     has_displacements = read_tags(path).get(_TAG) == _OTB
@@ -124,7 +116,8 @@ def read_grid(path: Path, left: Georeferencing) -> RectificationGrid:
         )
     grid.col_positions, grid.row_positions = sensor[..., 0], sensor[..., 1]
     if has_displacements:
-        grid.points = _pixels(columns, rows, left)
+        a, _, c, _, e, f = (left.transform or Affine.identity())[:6]  # without one, the image begins at 0, as in OTB
+        grid.points = (columns - c) / a - 0.5, (rows - f) / e - 0.5
     grid.interpolator = RegularGridInterpolator(grid.points, sensor, bounds_error=False, fill_value=None)
     return grid
 
@@ -138,14 +131,6 @@ def _scales(nodes: np.ndarray, sensor: np.ndarray) -> np.ndarray:
     return np.linalg.svd(np.linalg.lstsq(with_one, sensor[known], rcond=None)[0][:2], compute_uv=False)
 
 
-def _pixels(columns: np.ndarray, rows: np.ndarray, left: Georeferencing) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pixel positions of epipolar coordinates; an image without transform begins at 0, as in OTB."""
-    if left.transform is None:
-        return columns - 0.5, rows - 0.5
-    a, _, c, _, e, f = left.transform[:6]
-    return (columns - c) / a - 0.5, (rows - f) / e - 0.5
-
-
 def lattice_of(
     sensors: Sensors,
     region: Window,
@@ -153,11 +138,7 @@ def lattice_of(
     maximum: int,
     progress: Progress = lambda stage, done, total: None,
 ) -> Lattice:
-    """Triangulate a lattice over the pixels of a region of the left image and a range of disparities.
-
-    shareloc needs a quarter of a minute for a million points. Between nodes 32 pixels apart, interpolation is accurate
-    to less than 1 mm.
-    """
+    """Triangulate nodes over a region of the left image and disparities: a million points would take 15 s."""
     ends = (region.row, region.row_stop - 1), (region.column, region.column_stop - 1), (minimum, maximum)
     axes, spacing = zip(*(_axis(*pair) for pair in ends), strict=True)
     nodes = np.empty((*map(len, axes), 4))

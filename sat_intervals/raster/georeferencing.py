@@ -29,13 +29,10 @@ class ControlPoint(NamedTuple):
 
 @dataclass(frozen=True)
 class Georeferencing:
-    """CRS and transform, control points or RPCs, as far as the file has them.
-
-    ``transform`` maps pixels (column, row) to the CRS; offsets of ``rpcs`` are in pixels of this image.
-    """
+    """CRS and transform, control points or RPCs, as far as the file has them."""
 
     crs: CRS | None = None
-    transform: Affine | None = None
+    transform: Affine | None = None  # from column and row to the CRS
     gcps: tuple[ControlPoint, ...] = ()
     gcps_crs: CRS | None = None
     rpcs: RPC | None = None

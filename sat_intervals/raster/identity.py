@@ -21,22 +21,18 @@ from sat_intervals.store.folder import object_tag
 
 # GDAL's prefixes of object stores, and those of fsspec.
 _STORES = {"/vsis3/": "s3://", "/vsigs/": "gs://", "/vsiaz/": "az://"}
-# GDAL's prefix to read inside an archive.
-_INSIDE = re.compile(r"/vsi\w+/\{?")
-# Names that are no paths: GDAL's file systems and subdatasets, and URLs.
-_NO_PATH = re.compile(r"/vsi|\w+:")
-# Seconds until a server must answer.
-_TIMEOUT = 30
+_INSIDE = re.compile(r"/vsi\w+/\{?")  # GDAL's prefix to read inside an archive
+_NO_PATH = re.compile(r"/vsi|\w+:")  # names that are no paths: GDAL's file systems and subdatasets, and URLs
+_TIMEOUT = 30  # seconds until a server must answer
 # What cannot change pixels at full resolution, or says of them what `describe` says, too.
 _BESIDE = ".ovr", ".aux.xml"
 
 
 def identity(path: str, known: Mapping[str, Mapping[str, Any]] | None = None) -> dict[str, Any]:
-    """Return what identifies a file; ``known`` are earlier results by path.
+    """Return what identifies a file; ``known`` are earlier results by path, which need no hash for the same time.
 
-    For a local file: path, size in bytes, modification time and SHA-256. It is not hashed if a known one has the same
-    size and time. For a file inside an archive: those of the archive. For HTTP and object stores: size in bytes and
-    ETag, or modification time without one. For other files, and servers that do not answer: the path alone.
+    For a local file, or its archive: path, size in bytes, modification time and SHA-256. For HTTP and object stores:
+    size in bytes and ETag or modification time. For other files, and servers that do not answer: the path alone.
     """
     if file := local_file(path):
         if file == Path(path):

@@ -21,8 +21,7 @@ from sat_intervals.tiling import Window
 
 # Mask flags of bands without a mask of their own: GDAL derives one from nothing, the no-data value or the alpha band.
 _NO_MASK = ([MaskFlags.all_valid], [MaskFlags.nodata], [MaskFlags.per_dataset, MaskFlags.alpha])
-# Relative difference below which pixel sizes are equal up to rounding.
-_SAME_SIZE = 1e-6
+_SAME_SIZE = 1e-6  # relative difference below which pixel sizes are equal up to rounding
 
 _LOG = logging.getLogger(__name__)
 

@@ -50,10 +50,7 @@ def write_layer(
 
 
 def read_layers(path: str | os.PathLike[str], window: Window | None = None, band: int | None = None) -> np.ndarray:
-    """Read all bands of a file or of a window inside it, ``(bands, rows, columns)`` in the file's type.
-
-    Of one ``band``, counted from 1: ``(rows, columns)``.
-    """
+    """Read ``(bands, rows, columns)`` of a file or a window inside it, or ``(rows, columns)`` of one band from 1."""
     area = window and RasterioWindow(window.column, window.row, window.width, window.height)
     with opened(str(path), window) as dataset:
         return np.asarray(dataset.read(band, window=area))

@@ -17,14 +17,11 @@ from sat_intervals.raster.images import opened
 
 _GEOGRAPHIC = "EPSG:4326"
 Places = tuple[np.ndarray, np.ndarray, np.ndarray]  # degrees of longitude and latitude, and metres
-# Degrees of latitude beyond which UPS replaces UTM.
-_UTM = -80.0, 84.0
-# Degrees outside the area of a CRS that are accepted: the next UTM zone.
-_BEYOND = 6.0
+_UTM = -80.0, 84.0  # degrees of latitude beyond which UPS replaces UTM
+_BEYOND = 6.0  # degrees outside the area of a CRS that are accepted: the next UTM zone
 # Largest scale error of a map: above that of UTM in the next zone (1 %) and of polar maps at their edges (4 %).
 _LARGEST_DISTORTION = 0.05
-# Metres.
-_LARGEST_UNDULATION = 120.0
+_LARGEST_UNDULATION = 120.0  # metres
 
 
 def utm_of(longitude: float, latitude: float) -> str:
@@ -64,14 +61,11 @@ class Projection:
     def __init__(self, crs: str, geoid: Path | None = None) -> None:
         """``crs`` is a projected CRS in metres, ``geoid`` a grid of geoid heights that PROJ reads (GTX, GeoTIFF)."""
         target = _crs_of(crs)
+        name = f"{crs} ({target.name})"
         if not target.is_projected or target.axis_info[0].unit_name != "metre":
-            raise SatIntervalsError(
-                f"{crs} ({target.name}) is not a map in metres: give a projected CRS such as EPSG:32637"
-            )
+            raise SatIntervalsError(f"{name} is not a map in metres: give a projected CRS such as EPSG:32637")
         if len(target.axis_info) != 2:
-            raise SatIntervalsError(
-                f"{crs} ({target.name}) includes heights: give a horizontal CRS, and the geoid apart"
-            )
+            raise SatIntervalsError(f"{name} includes heights: give a horizontal CRS, and the geoid apart")
         self.crs = f"EPSG:{crs}" if crs.isdecimal() else crs
         self.definition = target
         self._area = target.area_of_use
@@ -138,9 +132,7 @@ class Frame:
         whole = _crs_of(crs)
         flat = whole.sub_crs_list[0] if whole.is_compound else whole
         if not (flat.is_geographic or flat.is_projected):
-            raise SatIntervalsError(
-                f"the CRS of {name}, {whole.name}, is a local one: give one of the Earth with --crs"
-            )
+            raise SatIntervalsError(f"the CRS of {name}, {whole.name}, is a local one: give one of the Earth")
         self.crs = flat.to_2d()
         # metres of a unit of height
         self.unit = whole.axis_info[2].unit_conversion_factor if len(whole.axis_info) > 2 else 1.0
@@ -190,10 +182,7 @@ def _check_ellipsoid(name: str, whole: CRS, vertical: Vertical, level: str) -> N
 
 
 def transformed(transformer: Transformer, *values: np.ndarray, inverse: bool = False) -> tuple[np.ndarray, ...]:
-    """Transform coordinates, arrays of any shape.
-
-    pyproj takes an array of one value for a number if numpy converts it to one, as it does before 2.4.
-    """
+    """Transform arrays of any shape: of one value, pyproj would take it for a number where numpy (before 2.4) does."""
     transform = partial(transformer.transform, direction="INVERSE" if inverse else "FORWARD")
     shape = np.shape(values[0])
     if shape == () or np.size(values[0]) != 1:

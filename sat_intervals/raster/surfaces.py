@@ -21,8 +21,7 @@ from sat_intervals.raster.images import opened
 from sat_intervals.tiling import Window
 
 Bounds = tuple[float, float, float, float]
-# Metres: a larger median difference is another datum, not an error.
-_DATUM = 10.0
+_DATUM = 10.0  # metres: a larger median difference is another datum, not an error
 
 
 def surface_place(path: Path) -> tuple[tuple[int, int], Georeferencing]:
@@ -103,9 +102,9 @@ def covered_window(path: Path, place: Georeferencing, shape: tuple[int, int]) ->
 def read_heights(
     path: Path, place: Georeferencing, shape: tuple[int, int], window: Window, *, smooth: bool = False
 ) -> np.ndarray:
-    """Read the first band of a raster at the centres of the cells in a window of a grid; NaN where it has no value.
+    """Read the first band, scaled, at the centres of the cells in a window of a grid, NaN if unknown.
 
-    Its mask, no-data value, scale and offset are applied; ``smooth`` interpolates, otherwise the nearest pixel is used.
+    ``smooth`` interpolates, otherwise the nearest pixel is used.
     """
     height, width = shape
     grid = {"crs": place.crs, "transform": place.transform, "height": height, "width": width}
@@ -125,10 +124,9 @@ def read_heights(
 
 
 def ground_of(path: Path, bounds: Bounds, around: float) -> tuple[np.ndarray, Georeferencing]:
-    """Return the heights of a raster in any CRS in degrees (EPSG:4326), and their georeferencing; raise if it is short.
+    """Return heights of a raster, resampled to EPSG:4326, and their georeferencing.
 
-    ``bounds``: least longitude and latitude, then the largest ones, of ground that it must cover; ``around``: degrees
-    more, where unknown heights are the median of the others.
+    It must cover ``bounds``, in degrees; ``around``: degrees more, where unknown heights are the median of the others.
     """
     shape, place = read_place(path)
     west, south, east, north = bounds
