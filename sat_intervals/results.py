@@ -17,7 +17,7 @@ from sat_intervals.products import BANDS, Bands
 from sat_intervals.raster import Georeferencing, Image, check_not_replaced, open_image, read_layers, read_tags
 from sat_intervals.raster.identity import absolute_in, identities
 from sat_intervals.raster.images import opened
-from sat_intervals.raster.published import is_surface_of, tags_beside
+from sat_intervals.raster.layers import is_surface_of, tags_beside
 from sat_intervals.raster.windows import Layer, read_small_image, read_small_layers
 from sat_intervals.tiling import Window, strips
 

@@ -12,8 +12,7 @@ import numpy as np
 from sat_intervals.evaluate.metrics import Intervals, share
 from sat_intervals.match.histogram import Histogram
 
-# Errors and widths are counted up to this many metres.
-LARGEST = 500
+LARGEST = 500  # errors and widths are counted up to this many metres
 # Factor of the NMAD, a robust standard deviation: sigma of a normal distribution (Hoehle and Hoehle 2009).
 _NORMAL = 1.4826
 

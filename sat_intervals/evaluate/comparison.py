@@ -11,40 +11,26 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.accuracy import LARGEST, Heights
 from sat_intervals.kernels.registration import REACH, every_nth, put_together, register, spread_blocks
 from sat_intervals.kernels.relief import sampled
-from sat_intervals.raster import (
-    GROUND,
-    Georeferencing,
-    check_reference,
-    covered_window,
-    datum_warnings,
-    is_surface,
-    read_heights,
-    read_layers,
-    read_place,
-    resolution_of,
-    warn_of_no_data,
-)
+from sat_intervals.raster import GROUND, Georeferencing, read_heights, read_layers, read_place, surface_place
+from sat_intervals.raster.heightfield import warn_of_no_data
+from sat_intervals.raster.surfaces import check_reference, covered_window, datum_warnings, resolution_of
 from sat_intervals.tiling import Grid, Window
 
-# Heights compared at a time, some hundred bytes each.
-_TILE = 1 << 20
+_TILE = 1 << 20  # heights compared at a time, some hundred bytes each
 # Smallest side of the blocks that register, in cells; cells around a window that slopes are taken from.
 _SMALLEST, _AROUND = 16, 4
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A surface model and its reference, moved by the shift of ``registration``, see `Registration.report`.
-
-    ``resolution`` is the size of the reference's pixels in metres, ``finer`` the number of its heights along a cell.
-    """
+    """A surface model and its reference, moved by the shift of ``registration``, see `Registration.report`."""
 
     surface: Path
     reference: Path
     shape: tuple[int, int]
     place: Georeferencing
-    resolution: float
-    finer: int
+    resolution: float  # of the reference in metres
+    finer: int  # heights of the reference along a cell
     registration: dict[str, Any] | None = None
 
     @property
@@ -55,12 +41,11 @@ class Comparison:
     @property
     def cell(self) -> float:
         """Return the side of a cell in metres."""
-        assert self.place.pixel_size is not None
         return self.place.pixel_size[0]
 
     def cells(self, window: Window, finer: int = 1) -> tuple[Georeferencing, tuple[int, int]]:
         """Return place and shape of a window of cells, perhaps beyond the surface, with ``finer`` per side of each."""
-        return self.place.shifted(window).refined(finer), (finer * window.height, finer * window.width)
+        return self.place.shifted(window).coarser(1 / finer, 1 / finer), (finer * window.height, finer * window.width)
 
     def heights(
         self, place: Georeferencing, shape: tuple[int, int], *, smooth: bool = False, needed: np.ndarray | None = None
@@ -85,8 +70,8 @@ class Comparison:
 
     def _moved(self, place: Georeferencing, shape: tuple[int, int], east: float, north: float) -> np.ndarray:
         """Read the reference moved by whole cells and, by slopes, the rest: interpolation would average noise away."""
-        assert place.pixel_size is not None
-        cell, rows, columns = place.pixel_size[0], shape[0] + 2 * _AROUND, shape[1] + 2 * _AROUND
+        cell = place.pixel_size[0]
+        rows, columns = (size + 2 * _AROUND for size in shape)
         across, down = round(east / cell), round(-north / cell)
         cells = place.shifted(Window(-_AROUND - down, -_AROUND - across, *shape))
         read = read_heights(self.reference, cells, (rows, columns), Window(0, 0, rows, columns))
@@ -101,23 +86,17 @@ def open_comparison(
 ) -> Comparison:
     """Open a surface model and its reference, which a registration moves."""
     surface, reference = Path(surface), Path(reference)
-    shape, place = read_place(surface)
-    if not is_surface(surface):
-        raise SatIntervalsError(f"{surface} is not a surface model of sat-intervals dsm: is it the --reference?")
+    shape, place = surface_place(surface)
     read_place(reference)
     check_reference(reference, surface)
     warn_of_no_data(reference)
-    assert place.pixel_size is not None
     resolution = resolution_of(reference, place)
     finer = max(1, round(place.pixel_size[0] / resolution))
     return Comparison(surface, reference, shape, place, resolution, finer, registration)
 
 
 def check_common(given: Comparison, count: int, median: float | None) -> list[str]:
-    """Warn of another datum; raise without a common height, or if they differ too much.
-
-    ``median`` is that of height - reference.
-    """
+    """Warn of another datum by the median of height - reference; raise without one, or if it is too large."""
     if not count or median is None:
         raise SatIntervalsError(
             f"no cell of {given.surface} has a height in {given.reference}: give a reference of the same place"

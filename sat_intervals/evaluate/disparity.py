@@ -93,10 +93,7 @@ def evaluate(
     remove_bias: bool = False,
     with_rejected: bool = False,
 ) -> dict[str, Any]:
-    """Evaluate rows given strip by strip from the top; each call of ``strips`` starts again at the top.
-
-    Returns the figures of `evaluate_run` without ``cost``.
-    """
+    """Return the figures of `evaluate_run` without ``cost``; each call of ``strips`` yields the rows from the top."""
     bias = _median_bias(strips()) if remove_bias else None
     criteria = replace(criteria, bias=bias or 0.0)
     kept, written = Metrics(criteria), Metrics(criteria)

@@ -35,10 +35,7 @@ class Criteria:
 
 
 class Intervals:
-    """Coverage, widths and score of the intervals of a group of pixels or cells.
-
-    The interval score (Gneiting and Raftery 2007) is ``width + 2 / (1 - nominal) * distance of a missed truth``.
-    """
+    """Coverage, widths and interval score (Gneiting and Raftery 2007) of a group of pixels or cells."""
 
     def __init__(self, widest: int, nominal: float | None) -> None:
         self._of_misses = None if nominal is None or nominal >= 1 else 2 / (1 - nominal)

@@ -18,10 +18,8 @@ SLOPES = (0.0, 5.0, 15.0, 30.0, 45.0, 90.0)
 HALF_WIDTHS = (0.0, 0.5, 1.0, 2.5, 5.0, 10.0, np.inf)
 # Share of the expected coverage below which a surface is of another place or upside down, not only too sure.
 _POOR = 0.5
-# Largest number of values of a raster of classes.
-_MOST_CLASSES = 64
-# Samples of a profile, and of those read at a time.
-_SAMPLES, _AT_ONCE = 4000, 256
+_MOST_CLASSES = 64  # largest number of values of a raster of classes
+_SAMPLES, _AT_ONCE = 4000, 256  # samples of a profile, and of those read at a time
 
 
 class _Ranges:
@@ -152,12 +150,8 @@ class Profile(NamedTuple):
 
 
 def read_profile(given: Comparison, line: tuple[float, float, float, float] | None = None) -> Profile:
-    """Read a surface and its reference along a line, by default the middle row.
-
-    ``line`` is easting and northing of both ends, in the surface's CRS.
-    """
-    place = given.place.transform
-    assert place is not None
+    """Read both along a line, easting and northing of its ends in the surface's CRS; by default the middle row."""
+    place = given.place.affine
     rows, columns = given.shape
     if line is None:
         y = place.f + (rows // 2 + 0.5) * place.e
@@ -184,16 +178,12 @@ def read_profile(given: Comparison, line: tuple[float, float, float, float] | No
 
 
 def error_map(given: Comparison, longest: int) -> tuple[np.ndarray, tuple[float, float, float, float]]:
-    """Return height - reference, sampled to ``longest`` cells at most along each side, and its map extent.
-
-    The extent is left, right, bottom and top.
-    """
+    """Return height - reference, at most ``longest`` cells along a side, and its left, right, bottom and top."""
     rows, columns = given.shape
     coarser = -(-max(given.shape) // longest)
     small = -(-rows // coarser), -(-columns // coarser)
     heights = read_small_layers(given.surface, small)[0].astype(np.float64)
     truth = given.heights(given.place.coarser(columns / small[1], rows / small[0]), small)
-    place = given.place.transform
-    assert place is not None
+    place = given.place.affine
     extent = place.c, place.c + columns * place.a, place.f + rows * place.e, place.f
     return heights - truth, extent

@@ -19,8 +19,7 @@ from sat_intervals.evaluate.comparison import Comparison, check_common, compared
 from sat_intervals.kernels.conformal import least_number, margins, widened
 from sat_intervals.raster import read_tags
 
-# Heights that are used: a sample, if there are more.
-_MOST = 1 << 20
+_MOST = 1 << 20  # heights that are used: a sample, if there are more
 # Classes with the same number of cells, fewer with few cells; blocks along each side of the ground.
 _CLASSES, _BLOCKS = (8, 4, 2, 1), 4
 

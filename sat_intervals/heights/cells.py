@@ -15,25 +15,18 @@ from sat_intervals.heights.point_cloud import Cells, PointCloud
 from sat_intervals.match.histogram import Histogram
 from sat_intervals.tiling import Window
 
-# Side of a tile in cells: some hundred megabytes.
-_TILE = 1024
+_TILE = 1024  # side of a tile in cells: some hundred megabytes
 # Cells of a strip of tiles, 24 bytes each, a few strips in memory; tiles of wide surfaces have fewer rows.
 _STRIP_CELLS, _LOWEST = 1 << 21, 64
-# Bounds listed for the medians of a tile: 4 bytes each.
-_LISTED = 1 << 24
-# Widths are counted in steps of 2 cm, up to so many metres.
-_STEPS, _WIDEST = 50, 1000
-# Metres: half widths from this on are reported as a share.
-WIDE = 20.0
+_LISTED = 1 << 24  # bounds listed for the medians of a tile: 4 bytes each
+_STEPS, _WIDEST = 50, 1000  # widths are counted in steps of 2 cm, up to so many metres
+WIDE = 20.0  # metres: half widths from this on are reported as a share
 
 
 def strips(
     threads: ThreadPoolExecutor, clouds: Sequence[PointCloud], cells: Cells, radius: float, choices: SurfaceChoices
 ) -> Iterator[tuple[int, np.ndarray, Counter[str]]]:
-    """Yield full-width strips from the top: first row, bands of SURFACE ``(6, rows, columns)``, and counts.
-
-    Counts are those of `PointCloud.splat` and ``poor_cells``, those left out. An error stops the running tiles.
-    """
+    """Yield first row, bands of SURFACE ``(6, rows, columns)``, and counts of full-width strips from the top."""
     ended = threading.Event()
 
     def tile(window: Window) -> tuple[np.ndarray, Counter[str]]:
@@ -62,7 +55,7 @@ def strips(
             if len(running) > 1:  # the next strip is computed while this one is written
                 yield finished()
         yield finished()
-    except BaseException:
+    except BaseException:  # the running tiles end, too
         ended.set()
         threads.shutdown(wait=False, cancel_futures=True)
         raise
@@ -76,12 +69,9 @@ def _tile_size(clouds: Sequence[PointCloud], cells: Cells, radius: float, choice
         most = _LISTED / reaching * min(cloud.ground.pixel_area for cloud in clouds) / cells.resolution**2
         rows = max(1, min(rows, int(math.sqrt(most))))
         columns = max(1, min(columns, int(most / rows)))
-    return _equal_part(cells.rows, rows), _equal_part(cells.columns, columns)
-
-
-def _equal_part(whole: int, most: int) -> int:
-    """Return the size of the equal parts of at most so many that a whole has."""
-    return -(-whole // -(-whole // most))
+    # equal parts
+    rows, columns = (-(-whole // -(-whole // most)) for whole, most in ((cells.rows, rows), (cells.columns, columns)))
+    return rows, columns
 
 
 class CellCounts:

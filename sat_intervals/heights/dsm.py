@@ -16,26 +16,14 @@ from sat_intervals.heights.lattice import Ground, joined, on_map
 from sat_intervals.heights.point_cloud import Cells, PointCloud
 from sat_intervals.machine import usable_cores
 from sat_intervals.progress import Progress
-from sat_intervals.raster import (
-    OutputWriter,
-    Projection,
-    files_of,
-    geoid_grid,
-    horizontal_name,
-    north_up,
-    read_place,
-    surface_file,
-    utm_of,
-)
+from sat_intervals.raster import OutputWriter, Projection, files_of, north_up, read_place, surface_file, utm_of
+from sat_intervals.raster.georeferencing import horizontal_name
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
 
-# More cells per pixel mean a wrong resolution or runs of different places.
-_CELLS_PER_PIXEL = 1000
-# Largest radius in cells: the work grows with its square.
-_REACH = 32
-# Metres: largest cell and largest radius.
-_LARGEST = 10_000.0
+_CELLS_PER_PIXEL = 1000  # more cells per pixel mean a wrong resolution or runs of different places
+_REACH = 32  # largest radius in cells: the work grows with its square
+_LARGEST = 10_000.0  # metres: largest cell and largest radius
 
 
 def make_surface(
@@ -96,7 +84,8 @@ def make_surface(
     choices = (choices or SurfaceChoices()).for_intervals(intervals)
     tags = surface_tags([run.report["finished"] for run in runs], intervals, choices, resolution, radius)
     tags["HEIGHTS"] = f"above {geoid or 'the WGS 84 ellipsoid'}"
-    projection = _projection(geometries, crs, geoid)
+    projection = Projection(crs or utm_of(*geometries[0].lattice.middle), geoid)
+    projection.check(*geometries[0].lattice.middle)
     clouds = [PointCloud(one.run, on_map(one.lattice, projection, str(one.run.out)), choices) for one in geometries]
     tally = CellCounts()
     with ThreadPoolExecutor(usable_cores()) as threads:
@@ -125,17 +114,14 @@ def make_surface(
 def _geometries(
     outs: Sequence[str | Path | Run], path: Path, given: Iterable[str | Path | None], progress: Progress
 ) -> list[Geometry]:
-    """Open runs, unless they are open, and read their models and grids.
-
-    Raise if a run is given twice, or if the surface would replace one of their files or a given one.
-    """
-    runs: list[Run] = []
-    for out in outs:
-        run = out if isinstance(out, Run) else open_run(out)
-        if known := [one.out for one in runs if one.report["finished"] == run.report["finished"]]:
-            raise SatIntervalsError(f"{known[0]} and {run.out} are the same run: give each run once")
-        runs.append(run)
-    geometries: list[Geometry] = []
+    """Return the geometry of each run; raise if one is given twice, or its files or given ones would be replaced."""
+    runs = [out if isinstance(out, Run) else open_run(out) for out in outs]
+    known: dict[str, Path] = {}
+    for run in runs:
+        other = known.setdefault(run.report["finished"], run.out)
+        if run is not runs[len(known) - 1]:
+            raise SatIntervalsError(f"{other} and {run.out} are the same run: give each run once")
+    geometries = []
     for run in runs:
         geometries.append(geometry_of(run, progress))
         run.check_kept([path], [run.out / FILE, *geometries[-1].files, *given])
@@ -150,10 +136,7 @@ def checked_cells(
     if isinstance(resolution, Path):
         grid, crs = _grid_of(resolution, crs)
         resolution = grid.resolution
-    if crs is not None:
-        Projection(crs, geoid)
-    elif geoid is not None:
-        geoid_grid(geoid)
+    Projection(crs or utm_of(0, 0), geoid)
     radius = resolution if radius is None else radius
     for name, value in (("resolution", resolution), ("radius", radius)):
         if not 0 < value <= _LARGEST:
@@ -183,10 +166,7 @@ def check_sensors(files: Sequence[str | Path], resolution: float | Path, crs: st
 def surface_tags(
     runs: Sequence[str], intervals: Sequence[Interval | None], choices: SurfaceChoices, cell: float, radius: float
 ) -> dict[str, str]:
-    """Return tags of a surface: when its runs finished, how its intervals are made, which coverage they are to reach.
-
-    ``choices`` have the defaults of these runs; ``cell`` and ``radius`` are metres.
-    """
+    """Return tags: when runs finished, how intervals are made, their coverage; ``cell`` and ``radius`` are metres."""
     levels = {("COVERAGE", one.coverage) if one.coverage else ("ALPHA", one.alpha) for one in intervals if one}
     tags = {"RUNS": " ".join(runs), **choices.tags(), "RADIUS": f"{radius:g} m"}
     tags |= {name: str(level) for name, level in levels} if len(levels) == 1 else {}
@@ -202,27 +182,18 @@ def surface_tags(
     return tags | {"REGISTERED": "yes" if calibration.registered else "no"}
 
 
-def _projection(geometries: Sequence[Geometry], crs: str | None, geoid: Path | None) -> Projection:
-    middle = geometries[0].lattice.middle
-    projection = Projection(crs or utm_of(*middle), geoid)
-    projection.check(*middle)
-    return projection
-
-
 def _grid_of(path: Path, given: str | None) -> tuple[Cells, str]:
     """Return the grid of a raster as cells of a surface, and its CRS, beside which none may be given."""
     if given is not None:
         raise SatIntervalsError(f"the CRS is that of {path}, but {given} is given too: leave it out")
     (rows, columns), place = read_place(path)
-    assert place.transform is not None
     assert place.crs is not None
-    across, down = place.transform.a, -place.transform.e
+    across, down = place.affine.a, -place.affine.e
     if not (across > 0 and abs(across - down) <= 1e-6 * across):
         raise SatIntervalsError(
             f"{path} has pixels of {across:g} x {down:g} m: give a north-up raster with square pixels"
         )
-    crs = horizontal_name(place.crs)
-    return Cells(place.transform.c, place.transform.f, across, rows, columns), crs
+    return Cells(place.affine.c, place.affine.f, across, rows, columns), horizontal_name(place.crs)
 
 
 def _cells(

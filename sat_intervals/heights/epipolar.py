@@ -23,22 +23,15 @@ with kernels_of_others():
     from shareloc.geofunctions.rectification import compute_stereorectification_epipolar_grids
     from shareloc.proj_utils import coordinates_conversion
 
-# Pixels between nodes, and nodes beyond the images, as in CARS.
-STEP, MARGIN = 30, 2
-# Pixels around the overlap, for ground that is higher or lower than the height of the grids.
-_BEYOND = 60
-# Share of the largest overlap that is as good.
-_AS_GOOD = 0.99
-# Share of the largest overlap below which a given altitude is doubted.
-_MUCH = 0.8
-# Ratio of pixel sizes up to which they are equal: the cubic then needs no smoothing.
-_EQUAL = 1.1
+STEP, MARGIN = 30, 2  # pixels between nodes, and nodes beyond the images, as in CARS
+_BEYOND = 60  # pixels around the overlap, for ground that is higher or lower than the height of the grids
+_AS_GOOD = 0.99  # share of the largest overlap that is as good
+_MUCH = 0.8  # share of the largest overlap below which a given altitude is doubted
+_EQUAL = 1.1  # ratio of pixel sizes up to which they are equal: the cubic then needs no smoothing
 # Base-to-height ratio below which a pixel of disparity is more than 25 m in an image of .5 m.
 _LEAST_BASE = 0.02
-# Nodes along an image to find the ground under its corners.
-_FEW = 100
-# Degrees of a DEM around the nodes, for ground that is higher or lower.
-_AROUND = 0.02
+_FEW = 100  # nodes along an image to find the ground under its corners
+_AROUND = 0.02  # degrees of a DEM around the nodes, for ground that is higher or lower
 
 _LOG = logging.getLogger(__name__)
 
@@ -213,10 +206,7 @@ def _footprint(left: SensorImage, nodes: np.ndarray, shape: tuple[int, int], hei
 
 
 def _dem(left: SensorImage, right: SensorImage, nodes: np.ndarray, terrain: Terrain, height: float) -> Any:
-    """Return the DEM around the left nodes as shareloc reads it, or its only height; raise if it does not cover them.
-
-    shareloc goes from node to node, also where they are far from the overlap.
-    """
+    """Return the DEM around all left nodes, which shareloc follows, or its only height; raise if it is smaller."""
     dem, geoid = str(terrain.dem), terrain.geoid and str(terrain.geoid)
     ground = left.model.direct_loc_h(*nodes[:: len(nodes) - 1].reshape(-1, 2).T, height)[:, :2]
     heights, place = ground_of(Path(dem), (*ground.min(axis=0), *ground.max(axis=0)), _AROUND)

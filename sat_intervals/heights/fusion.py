@@ -9,17 +9,15 @@ from sat_intervals.kernels.conformal import widened
 from sat_intervals.kernels.gridding import BOUNDED, CONFIDENCE, COUNT, HEIGHT, LOWER, UPPER, WEIGHT
 from sat_intervals.products import SURFACE
 
-# Metres: narrower intervals weigh as much as one of this width.
-_NARROWEST = 0.01
+_NARROWEST = 0.01  # metres: narrower intervals weigh as much as one of this width
 
 
 def fused(gathered: Sequence[np.ndarray]) -> np.ndarray:
     """Return the bands of SURFACE, ``(6, rows, columns)`` float32, from the cells of each run, see `PointCloud.splat`.
 
-    Heights and middles of intervals are means weighted by ``1 / width^2``; the width is that of the mean weight. It is
-    not divided by the root of the number of runs: errors of pairs of the same place are correlated. Where the intervals
-    do not meet, their hull is taken, and the height of the narrowest: a mean may be in none of them. Heights of runs
-    without intervals count where no run has one.
+    Heights and middles of intervals are means weighted by ``1 / width^2``, widths those of the mean weight, not divided
+    by the root of the number of runs: errors of pairs of one place are correlated. Where intervals do not meet, their
+    hull is taken, and the height of the narrowest: a mean may be in none of them. Without any, all heights count.
     """
     layers = np.stack(gathered, axis=1)  # of each layer, the cells of all runs
     count = layers[COUNT].sum(axis=0)

@@ -10,7 +10,7 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.heights.lattice import Lattice
-from sat_intervals.heights.rectified import rectified_files
+from sat_intervals.heights.rectify import rectified_files
 from sat_intervals.progress import Progress
 from sat_intervals.raster.identity import absolute_in, identity, local_file, relative_in
 from sat_intervals.raster.publishing import write_record
@@ -23,8 +23,7 @@ FILE = "geometry.json"
 _KINDS = "left_model", "right_model", "left_grid", "right_grid"
 _GIVE = "give left and right models and grids, for each OUT (--left-model, ...; in Python set_geometry)"
 
-# Metres between lines of sight above which models are suspect.
-SUSPECT = 0.1
+SUSPECT = 0.1  # metres between lines of sight above which models are suspect
 # Nodes of a grid beyond the image above which it may be that of another image: CARS adds up to three.
 _MOST_BEYOND = 4
 
@@ -77,10 +76,7 @@ def set_geometry(
 
 
 def geometry_of(run: Run, progress: Progress = lambda stage, done, total: None) -> Geometry:
-    """Return the geometry of a run; raise if `set_geometry` was not called for it, or a file has changed since.
-
-    That of a pair that `rectify` has made is set here.
-    """
+    """Return the geometry of a run, first set if `rectify` made its pair; raise without one, or if files changed."""
     from sat_intervals.heights.sensors import lattice_of
 
     images = [run.report["inputs"][side] for side in ("left", "right")]
@@ -106,10 +102,8 @@ def _sensors(run: Run, paths: Sequence[Path]) -> "tuple[Sensors, dict[str, float
     sensors = Sensors.load(*paths, left=run.left_georeferencing, rows=run.rows)
     search = run.config.disparity.minimum, run.config.disparity.maximum
     check_cover(sensors, run.region, run.report["inputs"]["right"]["width"], *search)
-    return sensors, {
-        "median_residual": median_residual(sensors, run.region, *search),
-        **_beyond(sensors.left_grid, run),
-    }
+    fit = {"median_residual": median_residual(sensors, run.region, *search)}
+    return sensors, fit | _beyond(sensors.left_grid, run)
 
 
 def _images(run: Run) -> list[str]:

@@ -21,8 +21,7 @@ _SIDE, _LEAST, _REDUCTION = 512, 64, 2
 _SPECKLE, _FEWEST = 60, 0.2
 # Share of matches, stray ones among them, beyond the range at each end, and its half with a margin for them.
 _BEYOND, _HALF = 0.02, 0.6
-# Share of the matches of the best reading of the tags from which another one fits.
-_AS_GOOD = 0.8
+_AS_GOOD = 0.8  # share of the matches of the best reading of the tags from which another one fits
 
 _LOG = logging.getLogger(__name__)
 
@@ -49,10 +48,7 @@ def read_with_ground(
 
 
 def ground_of(left: SensorImage, right: SensorImage) -> tuple[tuple[float, int] | None, float]:
-    """Return the middle of the heights of the ground and their reach in pixels, and the share of pixels that match.
-
-    None without enough matches, or where the height hardly matters.
-    """
+    """Return middle (metres) and reach (pixels) of the ground, None if unknown; and the share of pixels that match."""
     heights = common_heights(left, right)
     shares, parts = common_parts(left, right, heights, 0)
     if parts is None:
@@ -63,7 +59,7 @@ def ground_of(left: SensorImage, right: SensorImage) -> tuple[tuple[float, int] 
     middle = float(lowest + highest) / 2
     nodes, shape, base = shareloc_grids((left, right), parts, middle, step)
     most = (highest - lowest) / 2 * base / step
-    if not most > 1:
+    if not most > 1:  # the height hardly matters
         return None, 0.0
     images = [_epipolar(*one, shape, step) for one in zip((left, right), parts, nodes, strict=True)]
     found = match_level(images[0], images[1], (-math.ceil(most), math.ceil(most)), _SPECKLE)

@@ -11,8 +11,7 @@ from sat_intervals.kernels.lattice import interpolate
 from sat_intervals.raster import Projection
 from sat_intervals.tiling import Grid, Window
 
-# Side of a window of pixels whose points are made at a time: a block of the files of a run.
-WINDOW = 512
+WINDOW = 512  # side of a window of pixels whose points are made at a time: a block of the files of a run
 
 
 class Extent(NamedTuple):
@@ -25,8 +24,7 @@ class Extent(NamedTuple):
 
     def contains(self, other: "Extent") -> bool:
         """Return whether another extent is inside."""
-        begins = self.left <= other.left and self.bottom <= other.bottom
-        return begins and other.right <= self.right and other.top <= self.top
+        return joined([self, other]) == self
 
     def intersects(self, other: "Extent") -> bool:
         """Return whether both share a point."""
@@ -95,10 +93,7 @@ class Lattice:
 
 
 def on_map(lattice: Lattice, projection: Projection, name: str) -> Lattice:
-    """Return a lattice of easting, northing and height, above the geoid of the projection if it has one.
-
-    Nodes alone are projected. ``name`` is that of the run, for errors.
-    """
+    """Return a lattice of easting, northing and height, above the projection's geoid if any; ``name`` is for errors."""
     longitude, latitude, height = np.moveaxis(lattice.nodes[..., :3], -1, 0)
     down = projection.undulation(longitude, latitude)
     x, y = projection.place(longitude, latitude)

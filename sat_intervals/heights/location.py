@@ -4,15 +4,11 @@ import warnings
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import RegularGridInterpolator
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.sensors import Sensors
 from sat_intervals.raster import Projection, between_180
-
-try:
-    from scipy.interpolate import RegularGridInterpolator
-except ModuleNotFoundError as error:
-    raise SatIntervalsError("reference heights need shareloc: pip install 'sat-intervals[dsm]'") from error
 
 # Largest error of the inverse of a grid in sensor pixels, and iterations: a grid is affine but for a thousandth.
 _NEAR, _MOST = 1e-6, 30
@@ -25,10 +21,8 @@ class Location:
 
     def __init__(self, sensors: Sensors) -> None:
         self._turn = sensors.turn
-        self._views = (
-            (sensors.left_model, _Inverse(sensors.left_grid)),
-            (sensors.right_model, _Inverse(sensors.right_grid)),
-        )
+        grids = _Inverse(sensors.left_grid), _Inverse(sensors.right_grid)
+        self._views = list(zip((sensors.left_model, sensors.right_model), grids, strict=True))
 
     def positions(self, longitude: np.ndarray, latitude: np.ndarray, height: np.ndarray) -> np.ndarray:
         """Return ``(n, 4)`` row and column in the left, then in the right image, NaN where none, of points ``(n,)``.
@@ -72,10 +66,9 @@ class _Inverse:
 
 
 class GroundLattice:
-    """Interpolate the positions of ground points in both images between the nodes of a lattice on the map.
+    """Positions of ground points, interpolated between nodes on the map: exact ones take a minute for a million points.
 
-    ``lowest`` and ``highest`` are corners of a box: easting, northing, ellipsoidal height in metres, the unit of
-    ``pixel``, too. shareloc and the inverse of the grids need a minute for a million points.
+    ``lowest`` and ``highest`` are corners of a box: easting, northing, ellipsoidal height; metres, as ``pixel``.
     """
 
     def __init__(

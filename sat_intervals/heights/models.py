@@ -27,10 +27,8 @@ except ModuleNotFoundError as error:
     raise SatIntervalsError("sensor models need shareloc: pip install 'sat-intervals[dsm]'") from error
 
 T = TypeVar("T")
-# Half sizes of its domain by which positions and heights may be away from the middle of a model.
-_DOMAIN = 1.1
-# Positions along each side of an image at which the overlap is looked for.
-_SAMPLES = 65
+_DOMAIN = 1.1  # half sizes of its domain by which positions and heights may be away from the middle of a model
+_SAMPLES = 65  # positions along each side of an image at which the overlap is looked for
 # Heights that are tried.
 _LEVELS = 64
 _COEFFICIENTS = "num_col", "den_col", "num_row", "den_row"
@@ -134,10 +132,7 @@ class SensorImage:
 
 
 def _origins(image: Image, *, has_tags: bool) -> list[tuple[float, float]]:
-    """Return the places in the whole image that an image may have, by its geotransform.
-
-    RPC tags of a crop are of the file's own pixels, as GDAL reads them, or of the whole image.
-    """
+    """Return the places of an image in the whole one, by its geotransform: RPC tags of a crop may be of either."""
     own, place = (0.0, 0.0), image.georeferencing
     if place.transform is None:
         return [own]
@@ -155,7 +150,7 @@ def _origins(image: Image, *, has_tags: bool) -> list[tuple[float, float]]:
 
 
 def common_heights(left: SensorImage, right: SensorImage) -> np.ndarray:
-    """Return heights in the domain of both models."""
+    """Return heights in the domain of both models, ``(64,)`` metres."""
     lowest, highest = max(left.heights[0], right.heights[0]), min(left.heights[1], right.heights[1])
     return np.linspace(lowest, max(lowest, highest), _LEVELS)
 
@@ -163,10 +158,9 @@ def common_heights(left: SensorImage, right: SensorImage) -> np.ndarray:
 def common_parts(
     left: SensorImage, right: SensorImage, elevation: Any, beyond: int
 ) -> tuple[np.ndarray, tuple[Window, Window] | None]:
-    """Return the shares of the left image that the right one shows, and the parts of both that do; None without any.
+    """Return the shares of the left image that the right one shows, and these parts, grown; None without any.
 
-    Parts are grown by ``beyond`` pixels inside the images. ``elevation``: heights in metres ``(n,)``, which give n
-    shares, or one height, or shareloc's DEM.
+    ``elevation``: heights in metres ``(n,)``, which give n shares, or one height, or shareloc's DEM.
     """
     ends = zip(left.origin, (left.image.height, left.image.width), strict=True)
     places = np.meshgrid(*(first + np.linspace(0, size, _SAMPLES) for first, size in ends), indexing="ij")

@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from itertools import groupby
 from typing import NamedTuple
 
@@ -20,15 +19,12 @@ from sat_intervals.products import OPEN_ABOVE, OPEN_BELOW, RANGE_INCOMPLETE, Ban
 from sat_intervals.results import Run
 from sat_intervals.tiling import Grid, Tile, Window
 
-# Pixels around a point whose median outliers are compared with.
-_NEAR = 2
+_NEAR = 2  # pixels around a point whose median outliers are compared with
 # Points do not widen a surface that are fewer than this share of a window, or farther than so many metres, and than the
 # range of heights there, from all but the tails of the heights of their window.
 _FEW, _FAR, _TAIL = 1e-4, 20.0, 0.01
-# Confidence below which points beside missing data of the right image are left out.
-_DOUBTFUL = 0.1
-# The height among the values of a lattice.
-_HEIGHT = slice(2, 3)
+_DOUBTFUL = 0.1  # confidence below which points beside missing data of the right image are left out
+_HEIGHT = slice(2, 3)  # the height among the values of a lattice
 
 
 @dataclass(frozen=True)
@@ -78,13 +74,14 @@ class PointCloud:
         self._choices = choices
 
     def extent(self, threads: ThreadPoolExecutor) -> Extent | None:
-        """Return the extent of the points that contribute; None if there are none.
-
-        The outermost windows are read first, and those that cannot reach beyond what is found are not.
-        """
+        """Return the extent of the points that contribute, None without any, from the outermost windows inwards."""
         found = None
         tiles = Grid(Window(0, 0, *self.run.shape), WINDOW)
-        from_the_rim = partial(_from_the_rim, tiles)
+
+        def from_the_rim(tile: Tile) -> int:
+            row, column = tile.grid_row, tile.grid_column
+            return min(row, column, tiles.rows - 1 - row, tiles.columns - 1 - column)
+
         for _, ring in groupby(sorted(tiles, key=from_the_rim), from_the_rim):
             possible = ((tile.core, self.ground.extent(tile.core)) for tile in ring)
             windows = [window for window, extent in possible if extent and not (found and found.contains(extent))]
@@ -105,10 +102,9 @@ class PointCloud:
     def splat(
         self, cells: Cells, window: Window, radius: float, ended: threading.Event
     ) -> tuple[np.ndarray, Counter[str]]:
-        """Accumulate the points in a window of cells, see `kernels.gridding`; ``radius`` in metres; ``ended`` stops it.
+        """Accumulate points in a window of cells, see `kernels.gridding`, until ``ended``; ``radius`` in metres.
 
-        Also return the numbers of ``points`` that fall in these cells, and of those there that are left out as
-        ``outliers``, because their interval is ``open``, or at the ``border`` of the right image without confidence.
+        Also return the numbers of ``points`` in these cells, and of those left out, see `_places`.
         """
         gathered, counts = empty_cells(window.height, window.width), Counter[str]()
         near = []
@@ -140,7 +136,7 @@ class PointCloud:
         return Points(x, y, height, np.minimum(one, other), np.maximum(one, other), bands.confidence), left_out
 
     def _places(self, window: Window, bands: Bands) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Return x, y and height ``(3, rows, columns)`` of the points that contribute, and the masks of `points`."""
+        """Return x, y and height ``(3, rows, columns)`` of the points that contribute, and masks of those left out."""
         places = self.ground.lattice.points(window, bands.matched)
         height, left_out = places[2], dict[str, np.ndarray]()
         if self._choices.outliers is not None:
@@ -164,12 +160,6 @@ class PointCloud:
         away = np.where(known, height - base, 0)
         away = np.abs(away - median(away.astype(np.float32), known, 2 * _NEAR + 1))
         return np.asarray((known & (away > limit))[window.relative_to(around).slices])
-
-
-def _from_the_rim(tiles: Grid, tile: Tile) -> int:
-    """Return the number of tiles between a tile and the rim."""
-    ends = tile.grid_row, tile.grid_column, tiles.rows - 1 - tile.grid_row, tiles.columns - 1 - tile.grid_column
-    return min(ends)
 
 
 def _within(points: Sequence[np.ndarray], window: Window, reach: float) -> tuple[np.ndarray, ...]:

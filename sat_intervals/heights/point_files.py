@@ -12,8 +12,7 @@ import numpy as np
 from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.raster import Frame, Vertical, is_ground
 
-# Points read at a time.
-_PART = 500_000
+_PART = 500_000  # points read at a time
 # Names of columns, in lower case; the first found counts. Those of ICESat-2 and GEDI products are among them.
 _DEGREES = (("longitude", "lon", "long", "lon_lowestmode"), ("latitude", "lat", "lat_lowestmode"))
 _METRES = (("x", "easting", "east"), ("y", "northing", "north"))
@@ -21,15 +20,11 @@ _HEIGHTS = (
     "height", "h", "z", "elevation", "ellipsoidal_height", "h_mean", "h_te_best_fit", "h_te_median", "h_ph", "h_li",
     "elev_lowestmode", "elevation_lm")  # fmt: skip
 _GEOMETRIES = "wkt", "geometry", "geom", "the_geom"
-# Classes of LAS points that are noise.
-_NOISE = 7, 18
+_NOISE = 7, 18  # classes of LAS points that are noise
 
 
 class PointFile:
-    """Points of a CSV file with a header, Parquet, LAS, LAZ, or vectors of GDAL; ``crs`` replaces that of the file.
-
-    Columns of longitude and latitude are on the WGS 84 ellipsoid without ``crs``.
-    """
+    """Points of a CSV file with a header, Parquet, LAS, LAZ, or vectors of GDAL; ``crs`` replaces that of the file."""
 
     def __init__(self, path: Path, crs: str | None, vertical: Vertical) -> None:
         check_file(path, "give a file of points")
@@ -112,10 +107,8 @@ def _columns(path: Path, names: list[str], geometry: str | None) -> tuple[list[s
     geometry = geometry or next((known[name] for name in _GEOMETRIES if name in known), None)
     if geometry:
         return [geometry, *([height] if height else [])], False
-    raise SatIntervalsError(
-        f"{path} has the columns {', '.join(names)[:200]}: name them longitude, latitude, height, or x, y, height with "
-        "--crs"
-    )
+    listed = ", ".join(names)[:200]
+    raise SatIntervalsError(f"{path} has the columns {listed}: name them longitude, latitude, height, or x, y, height")
 
 
 def _crs_of_table(path: Path) -> str | None:

@@ -7,8 +7,7 @@ import numpy as np
 
 from sat_intervals.tiling import Window
 
-# Rows of a strip.
-_ROWS = 256
+_ROWS = 256  # rows of a strip
 # Number of points needed around a pixel to decide whether a point is hidden, and the largest distance in pixels that is
 # searched for them.
 _AROUND, _FURTHEST = 8, 8
@@ -17,12 +16,10 @@ _STEEPEST, _CLEAR = np.tan(np.radians(60.0)), 1.0
 
 
 class PointVisibility:
-    """The nearest of the points in each pixel of a region, kept in an empty file that is open for both ways.
-
-    ``rise`` is the signed change of disparity for a height of one pixel's size on the ground.
-    """
+    """The nearest of the points in each pixel of a region, kept in an empty file that is open for both ways."""
 
     def __init__(self, file: BinaryIO, region: Window, rise: float) -> None:
+        """``rise``: signed change of disparity for a height of one pixel's size on the ground."""
         self._region, self._rise, self._sign = region, rise, np.sign(rise)
         self._points = 0
         nothing = np.full(region.width, -np.inf, np.float32).tobytes()

@@ -13,12 +13,10 @@ from sat_intervals.tiling import Window
 
 # Side of a tile in pixels, fewer for fine references: at most this many cells of the reference below its pixels.
 _TILE, _LEAST, _CELLS = 256, 32, 1024
-# Tiles at once: their windows of a fine reference are most of the memory.
-_THREADS = 3
+_THREADS = 3  # tiles at once: their windows of a fine reference are most of the memory
 # Degrees: a pixel on a steeper patch between four heights has no disparity, as the place of a wall is known to a cell.
 _STEEPEST = 70.0
-# Cells around a window of the reference, for interpolation and the curvature of lines of sight.
-_MARGIN = 3
+_MARGIN = 3  # cells around a window of the reference, for interpolation and the curvature of lines of sight
 
 
 class _FarError(Exception):
@@ -29,8 +27,7 @@ class RasterVisibility:
     """Disparities of a raster of heights, strip by strip.
 
     ``lattice_of`` returns the `Lattice` of a run over disparities from the first to the second; ``lattice``, over those
-    of ``search``, is tried first. ``shift`` moves the raster on the map of ``projection``: easting, northing, height in
-    metres.
+    of ``search``, is tried first. ``shift`` moves the raster on the map: easting, northing, height in metres.
     """
 
     def __init__(
@@ -50,8 +47,7 @@ class RasterVisibility:
 
     def strips(self, pixel: float) -> Iterator[tuple[int, np.ndarray]]:
         """Yield first row and disparities ``(rows, columns)``, NaN if unknown; ``pixel`` is metres on the ground."""
-        side = int(_CELLS * self._raster.cell / pixel) // _LEAST * _LEAST
-        side = min(_TILE, max(_LEAST, side))
+        side = min(_TILE, max(_LEAST, int(_CELLS * self._raster.cell / pixel) // _LEAST * _LEAST))
         height, width = self._lattice.region.height, self._lattice.region.width
         with ThreadPoolExecutor(_THREADS) as threads:
             for row in range(0, height, side):
@@ -136,11 +132,8 @@ class RasterVisibility:
         """Return the cells under lines of sight between two heights."""
         top, bottom = sights[:, :, 0], sights[:, :, -1]
         fall = bottom - top
-        places = []
-        for height in (low, high):
-            part = (height - top[..., 2]) / fall[..., 2]
-            places.append(top[..., :2] + part[..., np.newaxis] * fall[..., :2])
-        x, y = (np.stack(places)[..., index] for index in range(2))
+        parts = (np.array([low, high])[:, np.newaxis, np.newaxis] - top[..., 2]) / fall[..., 2]
+        x, y = (top[..., axis] + parts * fall[..., axis] for axis in (0, 1))
         x, y = x[np.isfinite(x)], y[np.isfinite(y)]
         if not x.size:
             return Window(0, 0, 0, 0)

@@ -1,5 +1,6 @@
 """Make an epipolar pair of two raw images, with its grids and a record of how it was made: ``rectify.json``."""
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -10,11 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sat_intervals.errors import ChangedInputError, SatIntervalsError
-from sat_intervals.heights.rectified import FILE, GRIDS, IMAGES, read_record, rectified_files
 from sat_intervals.products import Band, plain
 from sat_intervals.progress import Progress
 from sat_intervals.raster import File, Georeferencing, Image, OutputWriter, check_not_replaced, describe
-from sat_intervals.raster.identity import identities, identity, relative_in
+from sat_intervals.raster.identity import absolute_in, identities, identity, relative_in
 from sat_intervals.raster.publishing import check_free, write_record
 from sat_intervals.store.lock import locked
 from sat_intervals.store.manifest import differences
@@ -22,6 +22,10 @@ from sat_intervals.store.manifest import differences
 if TYPE_CHECKING:
     from sat_intervals.heights.epipolar import Epipolar, Terrain
     from sat_intervals.heights.models import SensorImage
+
+FILE = "rectify.json"
+IMAGES = "left.tif", "right.tif"
+GRIDS = "left_grid.tif", "right_grid.tif"
 
 _GREY = (Band("grey level", "", "grey level of the raw image, resampled to epipolar geometry (cubic)"),)
 _NODES = (
@@ -53,11 +57,7 @@ def make_pair(
     compare: Compare | None = None,
     progress: Progress = lambda stage, done, total: None,
 ) -> dict[str, Any]:
-    """Write ``left.tif``, ``right.tif``, ``left_grid.tif``, ``right_grid.tif`` and ``rectify.json`` to a folder.
-
-    Returns the content of ``rectify.json``. What the folder has of the same inputs and settings is kept; rows are
-    compared if they were not.
-    """
+    """Write images, grids and record of a pair to a folder, unless it has them, and return the record."""
     from sat_intervals.heights.models import SensorImage
 
     pair.terrain.check()
@@ -77,20 +77,26 @@ def make_pair(
 
 
 def _make(
-    pair: RawPair,
-    readings: "Sequence[Sequence[SensorImage]]",
-    out: Path,
-    asked: dict[str, Any],
-    progress: Progress,
+    pair: RawPair, readings: "Sequence[Sequence[SensorImage]]", out: Path, asked: dict[str, Any], progress: Progress
 ) -> dict[str, Any]:
     """Write all files; return the record."""
-    from sat_intervals.heights.epipolar import epipolar_geometry
+    from sat_intervals.heights.epipolar import epipolar_geometry, grid_place
     from sat_intervals.heights.ground import read_with_ground
+    from sat_intervals.heights.resampling import nodata_of
 
     is_needed = pair.terrain.altitude is None and not pair.terrain.dem
     left, right, ground = read_with_ground(*readings, is_needed=is_needed)
     geometry = epipolar_geometry(left, right, pair.terrain, pair.resolution_of, ground)
-    with _writer(out, pair, geometry) as images, _grid_writer(out, geometry) as grids:
+    files = [
+        File(name, one.image.dtype, nodata_of(one.image), _GREY)
+        for name, one in zip(IMAGES, (left, right), strict=True)
+    ]
+    rows, columns, _ = geometry.left.shape
+    of_grids = [File(name, "float64", None, _NODES) for name in GRIDS]
+    with (
+        OutputWriter(out, files, geometry.height, geometry.width, Georeferencing(), _TAGS) as images,
+        OutputWriter(out, of_grids, rows, columns, grid_place(), _TAGS) as grids,
+    ):
         _write_images(images, (left, right), geometry, progress)
         grids.write(0, *(np.moveaxis(nodes[..., ::-1], -1, 0) for nodes in (geometry.left, geometry.right)))
         if changes := list(differences(asked, _asked(pair, left, right, {}))):
@@ -99,9 +105,7 @@ def _make(
         _note(out, asked | {"finished": None})
         images.publish()
         grids.publish()
-    record = asked | geometry.figures
-    record["bounds"] = "the upper bound of the disparity is the lower height"
-    record["rows"] = None
+    record = asked | geometry.figures | {"bounds": "the upper bound of the disparity is the lower height", "rows": None}
     record["finished"] = datetime.now(UTC).isoformat(timespec="seconds")
     _note(out, record)
     return record
@@ -146,24 +150,6 @@ def _is_needed(out: Path, asked: dict[str, Any], before: dict[str, Any], *, over
     return True
 
 
-def _writer(out: Path, pair: RawPair, geometry: "Epipolar") -> OutputWriter:
-    from sat_intervals.heights.resampling import nodata_of
-
-    files = [
-        File(name, image.dtype, nodata_of(image), _GREY)
-        for name, image in zip(IMAGES, (pair.left, pair.right), strict=True)
-    ]
-    return OutputWriter(out, files, geometry.height, geometry.width, Georeferencing(), _TAGS)
-
-
-def _grid_writer(out: Path, geometry: "Epipolar") -> OutputWriter:
-    from sat_intervals.heights.epipolar import grid_place
-
-    rows, columns, _ = geometry.left.shape
-    files = [File(name, "float64", None, _NODES) for name in GRIDS]
-    return OutputWriter(out, files, rows, columns, grid_place(), _TAGS)
-
-
 def _write_images(
     writer: OutputWriter, images: "tuple[SensorImage, SensorImage]", geometry: "Epipolar", progress: Progress
 ) -> None:
@@ -177,3 +163,28 @@ def _write_images(
         progress("resampling", row, geometry.height)
         writer.write(row, *strips)
     progress("resampling", geometry.height, geometry.height)
+
+
+def read_record(folder: Path) -> dict[str, Any] | None:
+    """Read the record of a folder; None if there is none, or another file of this name."""
+    try:
+        record = absolute_in(folder, json.loads((folder / FILE).read_bytes()))
+        return record if record.keys() >= {"inputs", "settings", "finished"} else None
+    except (FileNotFoundError, NotADirectoryError, ValueError, AttributeError):
+        return None
+    except OSError as error:
+        raise SatIntervalsError(f"{folder / FILE} cannot be read: {error.strerror}: choose another folder") from error
+
+
+def rectified_files(left: str | Path, right: str | Path) -> tuple[Path, Path, Path, Path] | None:
+    """Return models and grids of an epipolar pair that `rectify` has made; None if it has not."""
+    folder = Path(left).parent
+    if Path(right).parent != folder or (Path(left).name, Path(right).name) != IMAGES:
+        return None
+    record = read_record(folder)
+    if record is None:
+        return None
+    if not record["finished"]:
+        raise SatIntervalsError(f"{folder} holds an unfinished pair: rerun rectify")
+    left_model, right_model = (Path(record["inputs"][f"{side}_model"]["path"]) for side in ("left", "right"))
+    return left_model, right_model, folder / GRIDS[0], folder / GRIDS[1]

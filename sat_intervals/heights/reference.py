@@ -23,16 +23,13 @@ from sat_intervals.heights.sensors import check_cover, lattice_of
 from sat_intervals.kernels.registration import LEAST, Registration, register
 from sat_intervals.progress import Progress
 from sat_intervals.raster import HeightRaster, OutputWriter, Projection, Vertical, truth_file, utm_of
-from sat_intervals.raster.published import tag_of_left
+from sat_intervals.raster.layers import tag_of_left
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
 
-# Points to register with, chosen at random.
-_SAMPLE = 100_000
-# Metres around the region's ground in which points are read.
-_AROUND = 500.0
-# Positions along both axes of a region at which the row misfit is measured.
-_CHECKED = 9
+_SAMPLE = 100_000  # points to register with, chosen at random
+_AROUND = 500.0  # metres around the region's ground in which points are read
+_CHECKED = 9  # positions along both axes of a region at which the row misfit is measured
 # Correlation of disparities and truth below which left and right are swapped, and pixels that it takes.
 _SWAPPED, _ENOUGH = -0.5, 500
 
@@ -193,23 +190,18 @@ class _Work:
             yield row, strip
 
     def _points_seen(self, shift: np.ndarray, file: BinaryIO, progress: Progress) -> PointVisibility:
+        """Return what is seen of the points near the run, which are read twice: the lattice is around all of them."""
         sight = PointVisibility(file, self.run.region, self._rise)
-        lattice = self._seen_from(shift, progress)
-        if lattice is not None:
-            for part in self._near(progress):
-                row, column, _, right = lattice.positions(part + shift).T
-                sight.add(row, column, right - column)
-        return sight
-
-    def _seen_from(self, shift: np.ndarray, progress: Progress) -> GroundLattice | None:
-        """Return the lattice around all points near the run; None without a point."""
         lowest, highest = np.full(3, np.inf), np.full(3, -np.inf)
         for part in self._near(progress):
             lowest = np.minimum(lowest, part.min(axis=0, initial=np.inf))
             highest = np.maximum(highest, part.max(axis=0, initial=-np.inf))
-        if not np.isfinite(lowest).all():
-            return None
-        return GroundLattice(self._location, self._projection, lowest + shift, highest + shift, self._pixel)
+        if np.isfinite(lowest).all():
+            lattice = GroundLattice(self._location, self._projection, lowest + shift, highest + shift, self._pixel)
+            for part in self._near(progress):
+                row, column, _, right = lattice.positions(part + shift).T
+                sight.add(row, column, right - column)
+        return sight
 
 
 def _degrees(place: tuple[float, float]) -> str:

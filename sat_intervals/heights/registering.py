@@ -23,17 +23,13 @@ from sat_intervals.raster import HeightRaster, Projection
 from sat_intervals.results import Run
 from sat_intervals.tiling import Window
 
-# Smallest side of a block in pixels.
-_SMALLEST = 24
+_SMALLEST = 24  # smallest side of a block in pixels
 
 
 def blocks_of_raster(
     run: Run, lattice: Lattice, raster: HeightRaster, projection: Projection, pixel: float
 ) -> Blocks | None:
-    """Return points of a run on surfaces of a raster; None if nothing is common.
-
-    ``lattice`` is that of `on_map`; ``pixel`` is metres on the ground.
-    """
+    """Return points of a run on surfaces of a raster, None if nothing is common; ``pixel`` is metres on the ground."""
     cell = max(pixel, raster.cell)
     parts = []
     for window in spread_blocks(Window(0, 0, *run.shape), _SMALLEST):
@@ -47,10 +43,7 @@ def blocks_of_raster(
 
 
 def blocks_of_points(run: Run, lattice: Lattice, places: np.ndarray, pixel: float) -> Blocks | None:
-    """Return points, ``(n, 3)`` on the map and above the ellipsoid, on surfaces of a run; None without a point.
-
-    ``lattice`` is that of `on_map`; ``pixel`` is metres on the ground.
-    """
+    """Return points, ``(n, 3)`` on the map and above the ellipsoid, on surfaces of a run; None without a point."""
     cloud = PointCloud(run, lattice, SurfaceChoices("envelope").for_intervals([run.config.interval]))
     side = block_side(*run.shape, _SMALLEST) * pixel
     groups, numbers = np.unique(np.floor(places[:, :2] / side), axis=0, return_inverse=True)

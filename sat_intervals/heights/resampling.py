@@ -12,28 +12,18 @@ from sat_intervals.machine import usable_cores
 from sat_intervals.raster import BLOCK, Image, read_window
 from sat_intervals.tiling import Window
 
-# Columns of a tile, which is as high as a block of the files.
-_COLUMNS = 2 * BLOCK
-# Nodes from the image beyond which no pixel of it is between them.
-_FAR = 4
+_COLUMNS = 2 * BLOCK  # columns of a tile, which is as high as a block of the files
+_FAR = 4  # nodes from the image beyond which no pixel of it is between them
 
 
 @dataclass(frozen=True)
 class Resampled:
-    """An image and the positions of its epipolar pixels.
-
-    Attributes
-    ----------
-    nodes
-        ``(n, m, 2)`` rows and columns in the image, pixel centres are integers; see `epipolar.Epipolar` for the rest.
-    nodata
-        What pixels without a value get; pixels of this value are written one grey level away.
-    """
+    """An image and the positions of its epipolar pixels, see `epipolar.Epipolar`."""
 
     image: Image
-    nodes: np.ndarray
+    nodes: np.ndarray  # (n, m, 2) rows and columns in the image, pixel centres are integers
     scale: float
-    nodata: float
+    nodata: float  # of pixels without a value
 
     def read(self, window: Window) -> np.ndarray:
         """Return a window of the epipolar image in the image's type."""

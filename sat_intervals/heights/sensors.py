@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import RegularGridInterpolator
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.lattice import Lattice
@@ -16,25 +17,23 @@ from sat_intervals.heights.models import read_model, read_with  # raises without
 from sat_intervals.kernels.compiled import kernels_of_others
 from sat_intervals.kernels.row_offsets import RowOffsets
 from sat_intervals.progress import Progress
-from sat_intervals.raster import GROUND, Georeferencing, between_180
+from sat_intervals.raster import GROUND, Georeferencing, between_180, read_known, read_tags
 from sat_intervals.tiling import Window
 
 with kernels_of_others():
+    from affine import Affine
     from shareloc.geofunctions.rectification_grid import RectificationGrid
     from shareloc.geofunctions.triangulation import epipolar_triangulation
 
-    from sat_intervals.heights.grids import read_grid
-
-# Pixels between nodes of the lattice: interpolation errors are below 1 mm.
-_SPACING = 32
-# Nodes triangulated at a time, a kilobyte each.
-_AT_ONCE = 100_000
-# Positions along rows and columns of a region, to check models and grids.
-_CHECKED = 9
-# Degrees of longitude from the 180th meridian: models nearer to it are turned.
-_NEAR_180 = 2.0
+_SPACING = 32  # pixels between nodes of the lattice: interpolation errors are below 1 mm
+_AT_ONCE = 100_000  # nodes triangulated at a time, a kilobyte each
+_CHECKED = 9  # positions along rows and columns of a region, to check models and grids
+_NEAR_180 = 2.0  # degrees of longitude from the 180th meridian: models nearer to it are turned
 # Metres: lines of sight of one scene meet within centimetres, those of two scenes miss by hundreds of metres.
 _LARGEST_RESIDUAL = 10.0
+_TAG, _OTB = "METADATATYPE", "OTB"  # OTB 8 tags every raster that it writes with this
+# Sensor pixels per epipolar pixel, along and across: one at full resolution, more for reduced images.
+_SCALES = 0.4, 40.0
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ class Sensors:
         left: Georeferencing | None = None,
         rows: RowOffsets | None = None,
     ) -> "Sensors":
-        """Read RPC models, see `models.read_model`, and epipolar grids, see `grids.read_grid`."""
+        """Read RPC models, see `models.read_model`, and epipolar grids, see `read_grid`."""
         grid = partial(read_with, kind="epipolar grid", reader=partial(read_grid, left=left or Georeferencing()))
         models = read_model(left_model), read_model(right_model)
         return cls(*models, grid(left_grid), grid(right_grid), _turned(models), rows)
@@ -88,16 +87,48 @@ class Sensors:
 
 
 def _turned(models: Sequence[Any]) -> float:
-    """Turn models near the 180th meridian to longitude 0 and return by how much: shareloc has longitudes up to 180.
-
-    Turning about the Earth's axis changes neither heights nor distances.
-    """
+    """Turn models near the 180th meridian, where shareloc ends, about the Earth's axis to longitude 0; return it."""
     turn = float(models[0].offset_x)
     if 180 - abs(turn) > _NEAR_180:
         return 0.0
     for model in models:
         model.offset_x = between_180(model.offset_x - turn)
     return turn
+
+
+def read_grid(path: Path, left: Georeferencing) -> RectificationGrid:
+    """Read a grid, columns in band 1, rows in band 2, as sensor positions at epipolar ones: pixel centres are integers.
+
+    Grids of OTB have displacements from epipolar coordinates, for both images those of pixels in the georeferencing
+    ``left`` of the whole left epipolar image.
+    """
+    grid = RectificationGrid(str(path))
+    has_displacements = read_tags(path).get(_TAG) == _OTB
+    columns, rows = grid.points
+    nodes = np.stack(np.meshgrid(columns, rows, indexing="ij"), axis=-1)
+    # shareloc takes no-data values for positions
+    sensor = read_known(path)[:2].T + (nodes if has_displacements else 0.0)
+    scales = _scales(nodes, sensor)
+    if not (_SCALES[0] <= scales[-1] and scales[0] <= _SCALES[1]):
+        kind = f"displacements, as its tag {_TAG}={_OTB} says" if has_displacements else "sensor positions"
+        raise SatIntervalsError(
+            f"{path} does not contain {kind}: give the grid of CARS or shareloc, or that of OTB with tag {_TAG}={_OTB}"
+        )
+    grid.col_positions, grid.row_positions = sensor[..., 0], sensor[..., 1]
+    if has_displacements:
+        a, _, c, _, e, f = (left.transform or Affine.identity())[:6]  # without one, the image begins at 0, as in OTB
+        grid.points = (columns - c) / a - 0.5, (rows - f) / e - 0.5
+    grid.interpolator = RegularGridInterpolator(grid.points, sensor, bounds_error=False, fill_value=None)
+    return grid
+
+
+def _scales(nodes: np.ndarray, sensor: np.ndarray) -> np.ndarray:
+    """Return the largest and the smallest number of sensor pixels per unit of the nodes, of an affine fit."""
+    known = np.isfinite(sensor).all(axis=-1)
+    if np.iscomplexobj(sensor) or known.sum() < 3:
+        return np.zeros(2)
+    with_one = np.column_stack([nodes[known], np.ones(int(known.sum()))])
+    return np.linalg.svd(np.linalg.lstsq(with_one, sensor[known], rcond=None)[0][:2], compute_uv=False)
 
 
 def lattice_of(
@@ -107,11 +138,7 @@ def lattice_of(
     maximum: int,
     progress: Progress = lambda stage, done, total: None,
 ) -> Lattice:
-    """Triangulate a lattice over the pixels of a region of the left image and a range of disparities.
-
-    shareloc needs a quarter of a minute for a million points. Between nodes 32 pixels apart, interpolation is accurate
-    to less than 1 mm.
-    """
+    """Triangulate nodes over a region of the left image and disparities: a million points would take 15 s."""
     ends = (region.row, region.row_stop - 1), (region.column, region.column_stop - 1), (minimum, maximum)
     axes, spacing = zip(*(_axis(*pair) for pair in ends), strict=True)
     nodes = np.empty((*map(len, axes), 4))
@@ -156,13 +183,7 @@ def median_residual(sensors: Sensors, region: Window, minimum: int, maximum: int
     rows = np.linspace(region.row, region.row_stop - 1, _CHECKED)
     columns = np.linspace(region.column, region.column_stop - 1, _CHECKED)
     places = np.meshgrid(rows, columns, [minimum, maximum], indexing="ij")
-    try:
-        points = sensors.triangulate(*(place.ravel() for place in places))
-    except (ValueError, TypeError, ArithmeticError) as error:  # grids of complex numbers, for example
-        raise SatIntervalsError(
-            f"shareloc cannot use {sensors.left_grid.grid_filename} and {sensors.right_grid.grid_filename}: "
-            f"{' '.join(str(error).split())}"
-        ) from error
+    points = sensors.triangulate(*(place.ravel() for place in places))
     points = points[np.isfinite(points).all(axis=1)]
     if 2 * len(points) < places[0].size:
         raise SatIntervalsError(

@@ -18,14 +18,12 @@ from sat_intervals.raster import Layer, OutputWriter, Projection, between_180, n
 from sat_intervals.results import Run, open_input, open_run
 from sat_intervals.tiling import Grid, Window
 
-# Pixels computed at a time, 300 bytes each; pixels read ahead take 18 bytes.
-_PIXELS = 1 << 18
+_PIXELS = 1 << 18  # pixels computed at a time, 300 bytes each; pixels read ahead take 18 bytes
 # Positions are rounded to 0.01 mm on the ground and 0.1 mm in height, below the error of the lattice. This halves the
 # file.
 _DEGREES, _METRES = 2.0**-33, 2.0**-13
 _ENDINGS = ".tif", ".tiff", ".laz", ".las"
-# Metres: step of the coordinates in a LAS or LAZ file.
-_STEP = 0.001
+_STEP = 0.001  # metres: step of the coordinates in a LAS or LAZ file
 
 
 def triangulate(

@@ -1,7 +1,4 @@
-"""Provide the matcher as a method of CARS: ``dense_matching: {method: sat_intervals}``.
-
-It writes disparity, interval and confidence under the names that CARS' triangulation reads.
-"""
+"""Provide the matcher as a method of CARS: ``dense_matching: {method: sat_intervals}``."""
 
 from typing import Any
 
@@ -56,8 +53,7 @@ class SatIntervals(PandoraMethod, short_name=["sat_intervals"]):  # type: ignore
         self.method = "sat_intervals"
         self.corr_config: dict[str, Any] = {}
         self.loader = _NoLoader()
-        overlap = resolved(self._config(0, 0)).tiles.support
-        self.margins = Margins(overlap, overlap, overlap, overlap)
+        self.margins = Margins(*4 * [resolved(self._config(0, 0)).tiles.support])
 
     def _config(self, minimum: int, maximum: int) -> Config:
         """Return the settings with a search range.

@@ -11,17 +11,8 @@ from xarray.core import indexing
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import FLAGS, INVALID, WIDTH, flag_attributes
-from sat_intervals.raster import (
-    File,
-    Georeferencing,
-    grid_mapping,
-    is_surface,
-    read_layers,
-    read_place,
-    read_tags,
-    run_files,
-    surface_file,
-)
+from sat_intervals.raster import File, Georeferencing, read_layers, read_tags, run_files, surface_file, surface_place
+from sat_intervals.raster.projection import grid_mapping
 from sat_intervals.results import open_run
 from sat_intervals.tiling import Window
 
@@ -112,9 +103,7 @@ def open_surface(path: str | Path, chunks: int | None = 2048) -> xr.Dataset:
         The file cannot be read, or is no surface model of this package.
     """
     file = Path(path)
-    shape, place = read_place(file)
-    if not is_surface(file):
-        raise SatIntervalsError(f"{file} has not the bands of a surface model: give a dsm.tif of this package")
+    shape, place = surface_place(file)
     tags = read_tags(file)
     dataset = xr.Dataset(coords=_coordinates(place, shape))
     dataset.attrs = {"title": "surface model with intervals", "source": "sat-intervals"}

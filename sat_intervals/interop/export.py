@@ -20,10 +20,7 @@ _STRIP = 1 << 22  # pixels
 
 
 class Raster(NamedTuple):
-    """A file of layers (see `_read`), its value of invalid pixels, and the section of the settings that it needs.
-
-    A mask has a value of valid pixels instead.
-    """
+    """A file of layers, see `_read`, its value of invalid pixels (of a mask: valid ones), and the settings it needs."""
 
     name: str
     layers: tuple[str, ...]

@@ -40,8 +40,7 @@ def write_item(out: str | Path, *, taken: str | None = None, identifier: str | N
     run = open_run(out)
     file = run.out / "stac.json"
     run.check_kept([file])
-    item = _item(run, _times(run, taken), identifier or run.out.resolve().name)
-    write_record(file, item)
+    write_record(file, _item(run, _times(run, taken), identifier or run.out.resolve().name))
     return file
 
 
@@ -134,21 +133,20 @@ def _link(run: Run, side: str) -> dict[str, str]:
 
 def _assets(run: Run) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the key and the content of each asset; surface and maps of other runs are left out."""
-    yield (
-        "intervals",
-        _raster(run, "intervals.tif", "Disparity, its interval, confidence", interval_bands(run.config.extra_bands)),
-    )
+    bands = interval_bands(run.config.extra_bands)
+    yield "intervals", _raster(run, "intervals.tif", "Disparity, its interval, confidence", bands)
     yield "validity", _raster(run, "validity.tif", "Validity flags", (_VALIDITY,))
     if run.has_current("dsm.tif"):
         yield "dsm", _raster(run, "dsm.tif", "Surface model with intervals", SURFACE)
     report = {"title": "Settings, inputs, counts, times, versions", "type": "application/json", "roles": ["metadata"]}
     yield "report", report | _file(run.out / "run.json")
-    if run.has_current("overview.png"):
-        maps = {"title": "Maps", "type": "image/png", "roles": ["overview"]}
-        yield "overview", maps | _file(run.out / "overview.png")
-    if run.has_current("report.html"):
-        page = {"title": "Maps, profiles, histograms", "type": "text/html", "roles": ["overview"]}
-        yield "page", page | _file(run.out / "report.html")
+    pictures = (
+        ("overview", "overview.png", "Maps", "image/png"),
+        ("page", "report.html", "Maps, profiles, histograms", "text/html"),
+    )
+    for key, name, title, kind in pictures:
+        if run.has_current(name):
+            yield key, {"title": title, "type": kind, "roles": ["overview"]} | _file(run.out / name)
 
 
 def _file(path: Path) -> dict[str, Any]:

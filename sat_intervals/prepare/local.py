@@ -12,7 +12,7 @@ from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.products import RANGES
 from sat_intervals.raster import Image, Layer, OutputWriter, open_image, ranges_file, read_shape, read_window
 from sat_intervals.raster.identity import identity
-from sat_intervals.raster.published import tag_of_left, tags_beside
+from sat_intervals.raster.layers import tag_of_left, tags_beside
 from sat_intervals.tiling import Window
 
 # Rows that are written at a time.

@@ -23,8 +23,7 @@ from sat_intervals.raster.georeferencing import Georeferencing
 
 # Side of a block of the template, the smallest of GDAL's COG driver: larger ones take time and hold nothing.
 _SMALL = 128
-# Size from which a file is a BigTIFF.
-_CLASSIC = 1 << 32
+_CLASSIC = 1 << 32  # size from which a file is a BigTIFF
 # Tags of a TIFF directory, its types, and their sizes in bytes.
 _WIDTH, _HEIGHT, _BLOCK_WIDTH, _BLOCK_HEIGHT, _OFFSETS, _SIZES = 256, 257, 322, 323, 324, 325
 _SHORT, _LONG, _LONG8 = 3, 4, 16
@@ -67,11 +66,7 @@ def template(file: File, place: Georeferencing, tags: Mapping[str, str]) -> byte
 
 
 def assemble(
-    path: Path,
-    made: bytes,
-    shape: tuple[int, int],
-    levels: Sequence[Sequence[Part]],
-    copy_parts: CopyParts,
+    path: Path, made: bytes, shape: tuple[int, int], levels: Sequence[Sequence[Part]], copy_parts: CopyParts
 ) -> None:
     """Write a file in place from its `template` and the rows of blocks of each level, from the top; see `factors`."""
     sizes = [[size for part in level for size in part.sizes] for level in levels]

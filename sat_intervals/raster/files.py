@@ -2,6 +2,8 @@
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
+from math import nan
 
 from rasterio.io import DatasetWriter
 
@@ -42,7 +44,7 @@ _FLAG_TAGS = {
 }
 _VALIDITY = Band("validity", "", f"sum of bits; a pixel is valid where (validity & {INVALID}) == 0")
 
-INTERVALS = File("intervals.tif", "float32", float("nan"), BANDS)
+INTERVALS = File("intervals.tif", "float32", nan, BANDS)
 VALIDITY = File("validity.tif", "uint16", None, (_VALIDITY,), _FLAG_TAGS)
 RUN_FILES = (INTERVALS, VALIDITY)
 
@@ -53,21 +55,8 @@ def run_files(compression: str, extra: Collection[str] = ()) -> tuple[File, File
     return intervals, replace(VALIDITY, compression=compression)
 
 
-def points_file(name: str) -> File:
-    """Return the properties of a file of points."""
-    return File(name, "float64", float("nan"), POINTS, predictor="FLOATING_POINT")
-
-
-def surface_file(name: str) -> File:
-    """Return the properties of a surface model's file."""
-    return File(name, "float32", float("nan"), SURFACE)
-
-
-def truth_file(name: str) -> File:
-    """Return the properties of a file of true disparities."""
-    return File(name, "float32", float("nan"), TRUTH)
-
-
-def ranges_file(name: str) -> File:
-    """Return the properties of a file of local search ranges."""
-    return File(name, "int16", None, RANGES)
+# Files by name: points, surface models, true disparities, local search ranges.
+points_file = partial(File, dtype="float64", nodata=nan, bands=POINTS, predictor="FLOATING_POINT")
+surface_file = partial(File, dtype="float32", nodata=nan, bands=SURFACE)
+truth_file = partial(File, dtype="float32", nodata=nan, bands=TRUTH)
+ranges_file = partial(File, dtype="int16", nodata=None, bands=RANGES)

@@ -29,13 +29,10 @@ class ControlPoint(NamedTuple):
 
 @dataclass(frozen=True)
 class Georeferencing:
-    """CRS and transform, control points or RPCs, as far as the file has them.
-
-    ``transform`` maps pixels (column, row) to the CRS; offsets of ``rpcs`` are in pixels of this image.
-    """
+    """CRS and transform, control points or RPCs, as far as the file has them."""
 
     crs: CRS | None = None
-    transform: Affine | None = None
+    transform: Affine | None = None  # from column and row to the CRS
     gcps: tuple[ControlPoint, ...] = ()
     gcps_crs: CRS | None = None
     rpcs: RPC | None = None
@@ -53,11 +50,15 @@ class Georeferencing:
         )
 
     @property
-    def pixel_size(self) -> tuple[float, float] | None:
-        """Return width and height of a pixel in units of the CRS, None without a transform."""
-        if self.transform is None:
-            return None
-        a, b, _, d, e, _ = self.transform[:6]
+    def affine(self) -> Affine:
+        """Return the transform where there must be one."""
+        assert self.transform is not None
+        return self.transform
+
+    @property
+    def pixel_size(self) -> tuple[float, float]:
+        """Return width and height of a pixel in units of the CRS; needs a transform."""
+        a, b, _, d, e, _ = self.affine[:6]
         return math.hypot(a, d), math.hypot(b, e)
 
     def shifted(self, window: Window) -> "Georeferencing":
@@ -75,28 +76,19 @@ class Georeferencing:
 
     def moved(self, x: float, y: float) -> "Georeferencing":
         """Return the georeferencing with all pixels moved by x, y in units of the CRS; needs a transform."""
-        assert self.transform is not None
-        a, b, c, d, e, f = self.transform[:6]
+        a, b, c, d, e, f = self.affine[:6]
         return replace(self, transform=Affine(a, b, c + x, d, e, f + y))
 
     def coarser(self, across: float, down: float) -> "Georeferencing":
         """Return the georeferencing with pixels ``across`` x ``down`` times as large; needs a transform."""
-        assert self.transform is not None
-        a, b, c, d, e, f = self.transform[:6]
+        a, b, c, d, e, f = self.affine[:6]
         return replace(self, transform=Affine(a * across, b * down, c, d * across, e * down, f))
-
-    def refined(self, finer: int) -> "Georeferencing":
-        """Return the georeferencing with each pixel split into ``finer`` x ``finer``; needs a transform."""
-        return self.coarser(1 / finer, 1 / finer)
 
     def creation_options(self) -> dict[str, Any]:
         """Return rasterio's creation options for a new GeoTIFF, which stores a transform or control points."""
-        options: dict[str, Any] = {}
+        options: dict[str, Any] = {"crs": self.crs, "transform": self.transform}
         if self.gcps and self.transform is None:
-            points = [GroundControlPoint(row, column, x, y, z) for row, column, x, y, z in self.gcps]
-            options |= {"gcps": points, "crs": self.gcps_crs or CRS()}
-        else:
-            options |= {"crs": self.crs, "transform": self.transform}
+            options = {"gcps": [GroundControlPoint(*point) for point in self.gcps], "crs": self.gcps_crs or CRS()}
         if self.rpcs is not None:
             errors = {"ERR_BIAS": self.rpcs.err_bias, "ERR_RAND": self.rpcs.err_rand}  # to_gdal leaves out zeros
             known = {name: str(value) for name, value in errors.items() if value is not None}
@@ -119,9 +111,7 @@ def between_180(longitude: Any) -> Any:
 def footprint(place: Georeferencing, shape: tuple[int, int]) -> Corners | None:
     """Return longitude and latitude (degrees, WGS 84) of four corners, counter-clockwise; None without georeferencing.
 
-    Longitudes are continuous across 180.
-
-    Of an image with RPCs alone: the corners of the box for which they are valid, which is larger than the image.
+    Longitudes are continuous across 180. RPCs alone give the box for which they are valid, larger than the image.
     """
     height, width = shape
     if place.crs is not None and place.transform is not None:
@@ -133,11 +123,8 @@ def footprint(place: Georeferencing, shape: tuple[int, int]) -> Corners | None:
         corners = _box([point.x for point in place.gcps], [point.y for point in place.gcps])
         crs = place.gcps_crs
     elif place.rpcs is not None:
-        rpcs = place.rpcs
-        return _box(
-            [rpcs.long_off - rpcs.long_scale, rpcs.long_off + rpcs.long_scale],
-            [rpcs.lat_off - rpcs.lat_scale, rpcs.lat_off + rpcs.lat_scale],
-        )
+        x, y, width, height = (getattr(place.rpcs, name) for name in ("long_off", "lat_off", "long_scale", "lat_scale"))
+        return _box([x - width, x + width], [y - height, y + height])
     else:
         return None
     try:

@@ -12,8 +12,8 @@ from rasterio.transform import Affine
 from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.raster.frame import Frame, Places, Vertical
 from sat_intervals.raster.images import open_image, opened
+from sat_intervals.raster.projection import Frame, Places, Vertical
 from sat_intervals.raster.windows import read_window
 from sat_intervals.tiling import Window
 

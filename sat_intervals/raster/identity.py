@@ -1,35 +1,38 @@
-"""Identify input files, and keep outputs from replacing inputs."""
+"""Identify input files, list those that a raster is read from, and keep outputs from replacing them."""
 
 import hashlib
 import os
 import re
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from datetime import UTC, datetime
+from html import unescape
 from http.client import HTTPException
 from pathlib import Path
 from typing import Any
 from urllib.request import Request, urlopen
 
+from rasterio.io import DatasetReader
+
 from sat_intervals.errors import ChangedInputError, SatIntervalsError
+from sat_intervals.raster import gdal
 from sat_intervals.store.folder import object_tag
 
 # GDAL's prefixes of object stores, and those of fsspec.
 _STORES = {"/vsis3/": "s3://", "/vsigs/": "gs://", "/vsiaz/": "az://"}
-# GDAL's prefix to read inside an archive.
-_INSIDE = re.compile(r"/vsi\w+/\{?")
-# Names that are no paths: GDAL's file systems and subdatasets, and URLs.
-_NO_PATH = re.compile(r"/vsi|\w+:")
-# Seconds until a server must answer.
-_TIMEOUT = 30
+_INSIDE = re.compile(r"/vsi\w+/\{?")  # GDAL's prefix to read inside an archive
+_NO_PATH = re.compile(r"/vsi|\w+:")  # names that are no paths: GDAL's file systems and subdatasets, and URLs
+_TIMEOUT = 30  # seconds until a server must answer
+# What cannot change pixels at full resolution, or says of them what `describe` says, too.
+_BESIDE = ".ovr", ".aux.xml"
 
 
 def identity(path: str, known: Mapping[str, Mapping[str, Any]] | None = None) -> dict[str, Any]:
-    """Return what identifies a file; ``known`` are earlier results by path.
+    """Return what identifies a file; ``known`` are earlier results by path, which need no hash for the same time.
 
-    For a local file: path, size in bytes, modification time and SHA-256. It is not hashed if a known one has the same
-    size and time. For a file inside an archive: those of the archive. For HTTP and object stores: size in bytes and
-    ETag, or modification time without one. For other files, and servers that do not answer: the path alone.
+    For a local file, or its archive: path, size in bytes, modification time and SHA-256. For HTTP and object stores:
+    size in bytes and ETag or modification time. For other files, and servers that do not answer: the path alone.
     """
     if file := local_file(path):
         if file == Path(path):
@@ -109,6 +112,40 @@ def _of_url(url: str) -> dict[str, Any]:
     size = headers.get("Content-Range", "").rpartition("/")[2] or headers.get("Content-Length", "")
     tag = headers.get("ETag") or headers.get("Last-Modified")
     return {"bytes": int(size) if size.isdigit() else None, "etag": tag}
+
+
+def files_of(path: str) -> list[str]:
+    """Return a raster and all other files that GDAL reads its pixels from: sources of virtual rasters, and masks."""
+    try:
+        with gdal.reading(path) as dataset:
+            listed = [file for file in dataset.files if not _is_same(file, path)] + _sources(path, dataset)
+    except gdal.GDAL_ERRORS as error:  # it could be opened before
+        raise ChangedInputError(f"{path} cannot be read: {gdal.reason(error)}: restore it") from error
+    found = dict.fromkeys([path])
+    while listed:
+        file = listed.pop(0)
+        if file in found or file.lower().endswith(_BESIDE):
+            continue
+        found[file] = None
+        with suppress(*gdal.GDAL_ERRORS), gdal.reading(file) as dataset:  # other files are no rasters
+            listed += dataset.files + _sources(file, dataset)
+    return [path, *sorted(found.keys() - {path})]
+
+
+def _sources(path: str, dataset: DatasetReader) -> list[str]:
+    """Return local sources that a virtual raster names and GDAL does not list, such as those of its mask."""
+    text = dataset.tags(ns="xml:VRT").get("xml:VRT", "") if dataset.driver == "VRT" else ""
+    named = re.findall(r'<SourceFilename(?: relativeToVRT="(\d)")?[^>]*>([^<]+)', text)
+    files = [os.path.join(os.path.dirname(path) if relative == "1" else "", unescape(name)) for relative, name in named]
+    listed = {os.path.realpath(file) for file in dataset.files}
+    return [file for file in files if os.path.isfile(file) and os.path.realpath(file) not in listed]
+
+
+def _is_same(file: str, name: str) -> bool:
+    """Return whether GDAL lists a raster of this name as a file."""
+    scheme, is_url, place = name.partition("://")
+    is_listed = bool(is_url) and scheme != "vrt" and file.startswith("/vsi") and file.endswith(place)
+    return is_listed or Path(file).resolve() == Path(name).resolve()
 
 
 def check_not_replaced(

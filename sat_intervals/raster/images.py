@@ -15,15 +15,13 @@ from rasterio.io import DatasetReader
 from sat_intervals.errors import InputError
 from sat_intervals.kernels.row_offsets import RowOffsets
 from sat_intervals.raster import gdal
-from sat_intervals.raster.files_of import files_of
 from sat_intervals.raster.georeferencing import Georeferencing, horizontal_name
-from sat_intervals.raster.identity import identity, in_zip
+from sat_intervals.raster.identity import files_of, identity, in_zip
 from sat_intervals.tiling import Window
 
 # Mask flags of bands without a mask of their own: GDAL derives one from nothing, the no-data value or the alpha band.
 _NO_MASK = ([MaskFlags.all_valid], [MaskFlags.nodata], [MaskFlags.per_dataset, MaskFlags.alpha])
-# Relative difference below which pixel sizes are equal up to rounding.
-_SAME_SIZE = 1e-6
+_SAME_SIZE = 1e-6  # relative difference below which pixel sizes are equal up to rounding
 
 _LOG = logging.getLogger(__name__)
 
@@ -76,8 +74,8 @@ def open_image(
     name = _absolute(path)
     mask = None if mask is None else _absolute(mask)
     with opened(name) as dataset:
-        colours = enumerate(dataset.colorinterp, start=1)
-        alphas = [number for number, kind in colours if kind == ColorInterp.alpha and number != band]
+        colours = dataset.colorinterp
+        alphas = [number for number in dataset.indexes if colours[number - 1] == ColorInterp.alpha and number != band]
         others = [number for number in dataset.indexes if number not in alphas]
         band = _chosen(name, others, alphas, band)
         image = Image(
@@ -93,21 +91,22 @@ def open_image(
             georeferencing=Georeferencing.of(dataset),
             nodata_given=nodata is not None,
         )
-        if dataset.colorinterp[band - 1] == ColorInterp.palette:
-            raise InputError(
-                f"{name}: band {band} has a colour table, so its values are not grey levels: expand it first, with "
-                "gdal_translate -expand gray"
-            )
-        pages = len(dataset.subdatasets) if dataset.driver == "GTiff" else 0
-    if pages > 1:
-        _LOG.warning("%s has %d pages: the first is used; name another as GTIFF_DIR:2:%s", name, pages, name)
+        if colours[band - 1] == ColorInterp.palette:
+            remedy = "expand it with gdal_translate -expand gray"
+            raise InputError(f"{name}: band {band} has a colour table, so values are no grey levels: {remedy}")
+        if dataset.driver == "GTiff" and (pages := len(dataset.subdatasets)) > 1:
+            _LOG.warning("%s has %d pages: the first is used; name another as GTIFF_DIR:2:%s", name, pages, name)
     if alphas and len(others) > 1:
         remedy = f"if it is an image band, give gdal_edit.py -colorinterp_{alphas[0]} undefined"
         _LOG.warning("%s: band %d is read as alpha, 0 is no data: %s", name, alphas[0], remedy)
     if "complex" in image.dtype:
         raise InputError(f"{name}: band {band} is {image.dtype}, matching needs real values: give its amplitude")
-    if image.mask is not None:
-        _check_mask(image, image.mask)
+    if mask is not None:
+        with opened(mask) as dataset:
+            shape = dataset.shape
+        if shape != (image.height, image.width):
+            sizes = f"{shape[0]} x {shape[1]} pixels, {name} {image.height} x {image.width}"
+            raise InputError(f"{mask} has {sizes}: give a mask of the image's size")
     return image
 
 
@@ -134,10 +133,7 @@ def _identities(name: str, known: Mapping[str, Mapping[str, Any]] | None) -> dic
 
 
 def check_pair(left: Image, right: Image, count: int) -> None:
-    """Raise if the rows of two images do not correspond, or ``count`` disparities cannot be searched.
-
-    Widths and origins may differ: a disparity is measured in columns.
-    """
+    """Raise if rows do not correspond, or ``count`` disparities cannot be searched; widths and origins may differ."""
     pair = f"{left.path} and {right.path}"
     if left.height != right.height:
         raise InputError(
@@ -148,9 +144,8 @@ def check_pair(left: Image, right: Image, count: int) -> None:
     if here_crs and there_crs and here_crs != there_crs and horizontal_name(here_crs) != horizontal_name(there_crs):
         names = f"{here_crs.to_string()} and {there_crs.to_string()}"
         raise InputError(f"{pair} have different CRS, {names}: resample the pair together")
-    sizes = here.pixel_size, there.pixel_size
-    if sizes[0] and sizes[1] and not np.allclose(sizes[0], sizes[1], rtol=_SAME_SIZE, atol=0):
-        names = "{:.9g} x {:.9g} and {:.9g} x {:.9g}".format(*sizes[0], *sizes[1])
+    if here.transform and there.transform and not np.allclose(here.pixel_size, there.pixel_size, _SAME_SIZE, 0):
+        names = "{:.9g} x {:.9g} and {:.9g} x {:.9g}".format(*here.pixel_size, *there.pixel_size)
         raise InputError(f"{pair} have different pixel sizes, {names}: resample the pair together")
     if count > right.width:
         raise InputError(f"{right.path} has {right.width} columns, fewer than the {count} disparities: search fewer")
@@ -197,11 +192,3 @@ def _chosen(path: str, bands: list[int], alphas: list[int], band: int | None) ->
     if band is not None and band not in bands:
         raise InputError(f"{path} has no image band {band}, it has {there}{alpha}: choose with --band")
     return bands[0] if band is None else band
-
-
-def _check_mask(image: Image, mask: str) -> None:
-    with opened(mask) as dataset:
-        height, width = dataset.shape
-    if (height, width) != (image.height, image.width):
-        sizes = f"{height} x {width} pixels, {image.path} {image.height} x {image.width}"
-        raise InputError(f"{mask} has {sizes}: give a mask of the image's size")

@@ -1,8 +1,11 @@
-"""Read and write layers that fit in memory."""
+"""Read and write layers that fit in memory, and tags: which run or image a file was made from."""
 
+import logging
 import os
 from collections.abc import Mapping
+from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from rasterio import Env
@@ -16,6 +19,10 @@ from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.images import opened
 from sat_intervals.raster.publishing import new_file
 from sat_intervals.tiling import Window
+
+_LEFT = "LEFT_SHA256"  # tag of what belongs to a left image
+
+_LOG = logging.getLogger(__name__)
 
 
 def north_up(crs: str | int, x: float, y: float, pixel: float) -> Georeferencing:
@@ -43,10 +50,7 @@ def write_layer(
 
 
 def read_layers(path: str | os.PathLike[str], window: Window | None = None, band: int | None = None) -> np.ndarray:
-    """Read all bands of a file or of a window inside it, ``(bands, rows, columns)`` in the file's type.
-
-    Of one ``band``, counted from 1: ``(rows, columns)``.
-    """
+    """Read ``(bands, rows, columns)`` of a file or a window inside it, or ``(rows, columns)`` of one band from 1."""
     area = window and RasterioWindow(window.column, window.row, window.width, window.height)
     with opened(str(path), window) as dataset:
         return np.asarray(dataset.read(band, window=area))
@@ -68,3 +72,21 @@ def read_tags(path: str | os.PathLike[str]) -> dict[str, str]:
     """Read the tags of a file as a whole."""
     with opened(str(path)) as dataset:
         return dict(dataset.tags())
+
+
+def is_surface_of(surface: Path, run: str) -> bool:
+    """Return whether a surface model has points of a run, by the time when it finished."""
+    return run in read_tags(surface).get("RUNS", "").split()
+
+
+def tag_of_left(left: Mapping[str, Any]) -> dict[str, str]:
+    """Return the tag by which `tags_beside` recognises the left image of an `identity`; empty without its SHA-256."""
+    return {_LEFT: left["sha256"]} if "sha256" in left else {}
+
+
+def tags_beside(path: str | Path, left: Mapping[str, Any]) -> dict[str, str]:
+    """Return the tags of a raster; warn if it was made for another image than that of the `identity` ``left``."""
+    tags = read_tags(path)
+    if (made_for := tags.get(_LEFT)) and made_for != left.get("sha256", made_for):
+        _LOG.warning("%s was made for another left image than %s: check that it is of this pair", path, left["path"])
+    return tags

@@ -1,5 +1,6 @@
-"""Convert longitude and latitude to map coordinates, and ellipsoidal heights to heights above a geoid."""
+"""Convert points on the WGS 84 ellipsoid to maps, CRS and vertical references of files, and back."""
 
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,14 +16,12 @@ from sat_intervals.raster.georeferencing import Georeferencing, between_180
 from sat_intervals.raster.images import opened
 
 _GEOGRAPHIC = "EPSG:4326"
-# Degrees of latitude beyond which UPS replaces UTM.
-_UTM = -80.0, 84.0
-# Degrees outside the area of a CRS that are accepted: the next UTM zone.
-_BEYOND = 6.0
+Places = tuple[np.ndarray, np.ndarray, np.ndarray]  # degrees of longitude and latitude, and metres
+_UTM = -80.0, 84.0  # degrees of latitude beyond which UPS replaces UTM
+_BEYOND = 6.0  # degrees outside the area of a CRS that are accepted: the next UTM zone
 # Largest scale error of a map: above that of UTM in the next zone (1 %) and of polar maps at their edges (4 %).
 _LARGEST_DISTORTION = 0.05
-# Metres.
-_LARGEST_UNDULATION = 120.0
+_LARGEST_UNDULATION = 120.0  # metres
 
 
 def utm_of(longitude: float, latitude: float) -> str:
@@ -48,25 +47,27 @@ def grid_mapping(place: Georeferencing) -> dict[str, Any]:
     return attributes
 
 
+def _crs_of(name: str) -> CRS:
+    """Return the CRS of a name such as EPSG:2154, 2154 or WKT."""
+    try:
+        return CRS.from_user_input(f"EPSG:{name}" if name.isdecimal() else name)
+    except CRSError as error:
+        raise SatIntervalsError(f"{name} is not a CRS known to PROJ: give one such as EPSG:32637") from error
+
+
 class Projection:
     """Convert points to map coordinates in metres, and heights above the ellipsoid to heights above a geoid."""
 
     def __init__(self, crs: str, geoid: Path | None = None) -> None:
         """``crs`` is a projected CRS in metres, ``geoid`` a grid of geoid heights that PROJ reads (GTX, GeoTIFF)."""
-        crs = f"EPSG:{crs}" if crs.isdecimal() else crs
-        try:
-            target = CRS.from_user_input(crs)
-        except CRSError as error:
-            raise SatIntervalsError(f"{crs} is not a CRS known to PROJ: give one such as EPSG:32637") from error
+        target = _crs_of(crs)
+        name = f"{crs} ({target.name})"
         if not target.is_projected or target.axis_info[0].unit_name != "metre":
-            raise SatIntervalsError(
-                f"{crs} ({target.name}) is not a map in metres: give a projected CRS such as EPSG:32637"
-            )
+            raise SatIntervalsError(f"{name} is not a map in metres: give a projected CRS such as EPSG:32637")
         if len(target.axis_info) != 2:
-            raise SatIntervalsError(
-                f"{crs} ({target.name}) includes heights: give a horizontal CRS, and the geoid apart"
-            )
-        self.crs, self.definition = crs, target
+            raise SatIntervalsError(f"{name} includes heights: give a horizontal CRS, and the geoid apart")
+        self.crs = f"EPSG:{crs}" if crs.isdecimal() else crs
+        self.definition = target
         self._area = target.area_of_use
         self._proj = Proj(target)
         self._map = Transformer.from_crs(_GEOGRAPHIC, target, always_xy=True)
@@ -113,11 +114,75 @@ class Projection:
         return undulation(self._geoid, longitude, latitude)
 
 
-def transformed(transformer: Transformer, *values: np.ndarray, inverse: bool = False) -> tuple[np.ndarray, ...]:
-    """Transform coordinates, arrays of any shape.
+@dataclass(frozen=True)
+class Vertical:
+    """What heights refer to, as a person states it: the ellipsoid, a geoid grid, or nothing (then the file must)."""
 
-    pyproj takes an array of one value for a number if numpy converts it to one, as it does before 2.4.
-    """
+    ellipsoid: bool = False
+    geoid: Path | None = None
+
+
+class Frame:
+    """The coordinates of a file of heights."""
+
+    def __init__(self, name: str, crs: str | None, vertical: Vertical, level: str = "") -> None:
+        """``name`` is for messages, ``crs`` WKT or such as EPSG:2154, ``level`` tag HEIGHTS of our surface models."""
+        if crs is None:
+            raise SatIntervalsError(f"{name} has no CRS: give it with --crs, such as EPSG:32637")
+        whole = _crs_of(crs)
+        flat = whole.sub_crs_list[0] if whole.is_compound else whole
+        if not (flat.is_geographic or flat.is_projected):
+            raise SatIntervalsError(f"the CRS of {name}, {whole.name}, is a local one: give one of the Earth")
+        self.crs = flat.to_2d()
+        # metres of a unit of height
+        self.unit = whole.axis_info[2].unit_conversion_factor if len(whole.axis_info) > 2 else 1.0
+        self._geoid = None if vertical.geoid is None else geoid_grid(vertical.geoid)
+        self._grid = vertical.geoid
+        if vertical.geoid is None:
+            _check_ellipsoid(name, whole, vertical, level)
+        self._from_ellipsoid = Transformer.from_crs(_GEOGRAPHIC, self.crs, always_xy=True)
+
+    @property
+    def metres(self) -> float:
+        """Return the metres of a unit of the CRS, about those of a degree of latitude if it is geographic."""
+        factor = float(self.crs.axis_info[0].unit_conversion_factor)
+        return factor * 6_371_000 if self.crs.is_geographic else factor
+
+    def from_ellipsoid(self, longitude: np.ndarray, latitude: np.ndarray, height: np.ndarray) -> Places:
+        """Return x, y and height in the frame of points on the WGS 84 ellipsoid; NaN outside the geoid grid."""
+        x, y = transformed(self._from_ellipsoid, longitude, latitude)
+        return x, y, (height - undulation(self._geoid, longitude, latitude)) / self.unit
+
+    def to_ellipsoid(self, x: np.ndarray, y: np.ndarray, height: np.ndarray) -> Places:
+        """Return longitude, latitude (WGS 84) and ellipsoidal height of points in the frame."""
+        longitude, latitude = transformed(self._from_ellipsoid, x, y, inverse=True)
+        return longitude, latitude, height * self.unit + undulation(self._geoid, longitude, latitude)
+
+    def check(self, longitude: float, latitude: float) -> None:
+        """Raise if the geoid grid does not cover a place (degrees)."""
+        if np.isnan(undulation(self._geoid, np.array([longitude]), np.array([latitude]))[0]):
+            raise SatIntervalsError(
+                f"{self._grid} has no geoid height at longitude {longitude:.2f}, latitude {latitude:.2f}: give a grid "
+                "that covers the run"
+            )
+
+
+def _check_ellipsoid(name: str, whole: CRS, vertical: Vertical, level: str) -> None:
+    """Raise if heights refer to a geoid, or to nothing that is known."""
+    datum = whole.sub_crs_list[1].name if whole.is_compound else ""
+    if datum and "ellipsoid" not in datum.lower():
+        raise SatIntervalsError(f"{name} has heights of {datum}: give the grid of this geoid with --geoid")
+    if vertical.ellipsoid or datum or len(whole.axis_info) > 2 or level.endswith("ellipsoid"):
+        return
+    if level:
+        raise SatIntervalsError(f"{name} has heights {level}: give this grid with --geoid")
+    raise SatIntervalsError(
+        f"{name} does not say what its heights refer to: give --ellipsoid, or the grid of their geoid with --geoid"
+    )
+
+
+def transformed(transformer: Transformer, *values: np.ndarray, inverse: bool = False) -> tuple[np.ndarray, ...]:
+    """Transform arrays of any shape: of one value, pyproj would take it for a number where numpy (before 2.4) does."""
     transform = partial(transformer.transform, direction="INVERSE" if inverse else "FORWARD")
     shape = np.shape(values[0])
     if shape == () or np.size(values[0]) != 1:

@@ -38,10 +38,9 @@ def check_free(path: str | os.PathLike[str], *, overwrite: bool) -> None:
 
 @contextmanager
 def new_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary name beside a path, for the block to write the file; rename it at the end, or delete it.
+    """Yield an empty temporary file beside a path, to be written in place; rename it at the end, or delete it.
 
-    The temporary file exists, is empty, and must be written in place. The next call replaces what a killed process
-    left of it. Raise OutputError if the file cannot be written, or another process is writing it.
+    The next call replaces what a killed process left. Raise OutputError if another process is writing the file.
     """
     with failing(Path(path)), unfinished(Path(path)) as file:
         yield file.temporary

@@ -13,8 +13,7 @@ from sat_intervals.raster import gdal
 from sat_intervals.raster.identity import in_zip
 from sat_intervals.raster.images import opened
 
-# What GDAL reads beside an image only, and what shareloc does not read at all.
-_BESIDE = ".rpb", "_rpc.txt"
+_BESIDE = ".rpb", "_rpc.txt"  # what GDAL reads beside an image only, and what shareloc does not read at all
 # Names in the order of files without names, after two errors in some.
 _SINGLE = [f"{axis}_{what}" for what in ("OFF", "SCALE") for axis in ("LINE", "SAMP", "LAT", "LONG", "HEIGHT")]
 _LISTS = [f"{axis}_{part}_COEFF_{i}" for axis in ("LINE", "SAMP") for part in ("NUM", "DEN") for i in range(1, 21)]

@@ -21,21 +21,19 @@ from sat_intervals.raster.images import opened
 from sat_intervals.tiling import Window
 
 Bounds = tuple[float, float, float, float]
-# Metres: a larger median difference is another datum, not an error.
-_DATUM = 10.0
+_DATUM = 10.0  # metres: a larger median difference is another datum, not an error
 
 
-def is_surface(path: Path) -> bool:
-    """Return whether a file has the bands of a surface model."""
-    try:
-        with opened(str(path)) as dataset:
-            return bool(dataset.descriptions == tuple(band.name for band in SURFACE))
-    except SatIntervalsError:
-        return False
+def surface_place(path: Path) -> tuple[tuple[int, int], Georeferencing]:
+    """Return what `read_place` does; raise if a file has not the bands of a surface model."""
+    with opened(str(path)) as dataset:
+        if dataset.descriptions != tuple(band.name for band in SURFACE):
+            raise SatIntervalsError(f"{path} is not a surface model of sat-intervals dsm: give one, or make it again")
+    return read_place(path)
 
 
 def read_place(path: Path) -> tuple[tuple[int, int], Georeferencing]:
-    """Return rows and columns of a surface model, and its georeferencing, which must be north up."""
+    """Return rows and columns of a raster, and its georeferencing, which must be north up."""
     with opened(str(path)) as dataset:
         place = Georeferencing.of(dataset)
         if place.crs is None or place.transform is None or place.transform.b or place.transform.d:
@@ -51,9 +49,7 @@ def check_reference(path: Path, surface: Path) -> None:
         level = dataset.tags().get("HEIGHTS", "")
     parts = crs.sub_crs_list if crs.is_compound else [crs]
     if not (parts[0].is_geographic or parts[0].is_projected):
-        raise SatIntervalsError(
-            f"the CRS of {path}, {crs.name}, is a local one: give a reference with a CRS of the Earth"
-        )
+        raise SatIntervalsError(f"the CRS of {path}, {crs.name}, is a local one: give a reference on the Earth")
     if len(crs.axis_info) > 2 and crs.axis_info[2].unit_conversion_factor != 1:
         unit = crs.axis_info[2].unit_name
     if unit:
@@ -88,8 +84,7 @@ def resolution_of(path: Path, place: Georeferencing) -> float:
 
 def covered_window(path: Path, place: Georeferencing, shape: tuple[int, int]) -> Window:
     """Return the part of a north-up grid of cells that the extent of a raster covers; all cells if it is unknown."""
-    whole, grid = Window(0, 0, *shape), place.transform
-    assert grid is not None
+    whole, grid = Window(0, 0, *shape), place.affine
     with opened(str(path)) as dataset:
         given = dataset.bounds
         cells = transform_bounds(place.crs, dataset.crs, *array_bounds(*shape, grid))
@@ -107,9 +102,9 @@ def covered_window(path: Path, place: Georeferencing, shape: tuple[int, int]) ->
 def read_heights(
     path: Path, place: Georeferencing, shape: tuple[int, int], window: Window, *, smooth: bool = False
 ) -> np.ndarray:
-    """Read the first band of a raster at the centres of the cells in a window of a grid; NaN where it has no value.
+    """Read the first band, scaled, at the centres of the cells in a window of a grid, NaN if unknown.
 
-    Its mask, no-data value, scale and offset are applied; ``smooth`` interpolates, otherwise the nearest pixel is used.
+    ``smooth`` interpolates, otherwise the nearest pixel is used.
     """
     height, width = shape
     grid = {"crs": place.crs, "transform": place.transform, "height": height, "width": width}
@@ -129,10 +124,9 @@ def read_heights(
 
 
 def ground_of(path: Path, bounds: Bounds, around: float) -> tuple[np.ndarray, Georeferencing]:
-    """Return the heights of a raster in any CRS in degrees (EPSG:4326), and their georeferencing; raise if it is short.
+    """Return heights of a raster, resampled to EPSG:4326, and their georeferencing.
 
-    ``bounds``: least longitude and latitude, then the largest ones, of ground that it must cover; ``around``: degrees
-    more, where unknown heights are the median of the others.
+    It must cover ``bounds``, in degrees; ``around``: degrees more, where unknown heights are the median of the others.
     """
     shape, place = read_place(path)
     west, south, east, north = bounds
@@ -168,8 +162,7 @@ def ground_of(path: Path, bounds: Bounds, around: float) -> tuple[np.ndarray, Ge
 
 def _cells(place: Georeferencing, bounds: Bounds) -> Window:
     """Return the cells of a raster, north or south up, around bounds in degrees."""
-    assert place.transform is not None
-    a, _, c, _, e, f = place.transform[:6]
+    a, _, c, _, e, f = place.affine[:6]
     left, bottom, right, top = transform_bounds("EPSG:4326", place.crs, *bounds)
     rows, columns = sorted(((bottom - f) / e, (top - f) / e)), sorted(((left - c) / a, (right - c) / a))
     return Window.around(*zip(rows, columns, strict=True))

@@ -17,8 +17,7 @@ from sat_intervals.tiling import View, Views, Window
 
 # Types whose values are all exact in float32.
 _FLOAT32_HOLDS = {"uint8", "int8", "uint16", "int16", "float16", "float32"}
-# Integers up to this are exact in float64.
-_EXACT = 2**53
+_EXACT = 2**53  # integers up to this are exact in float64
 # Shares by which floats may differ from a no-data value as people write it, the second one above the third number.
 _DIGITS, _FEW_DIGITS, _LARGE = {"float32": 1e-6}, 1e-3, 1e38
 
@@ -29,9 +28,7 @@ def read_views(images: Iterable[Image], windows: Iterable[Window]) -> Views:
 
 
 def read_window(image: Image, window: Window) -> tuple[np.ndarray, np.ndarray]:
-    """Read a window, which may be partly or wholly outside the image, and the states of its pixels.
-
-    Of an image with row offsets, it is read at the rows that they lead to.
+    """Read a window, perhaps outside the image, at the rows that row offsets lead to, and the states of its pixels.
 
     Pixels are ``(height, width)``, float32 if that is exact for the file's type, else float64; 0 where not usable.
     States are uint8: 0 = usable; bit NO_DATA = outside the image, no-data value, the file's mask or alpha, NaN or

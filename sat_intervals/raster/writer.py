@@ -22,9 +22,8 @@ from sat_intervals.raster.streaming import Stream
 class OutputWriter:
     """Write files of a folder from full-width strips in increasing order, or from parts that were made elsewhere.
 
-    Memory depends on the strip, but pictures (PNG) are kept in it. Until `publish` all files have temporary names, see
-    `new_file`; leaving the context removes these. All methods raise `OutputError` with the name of the final file.
-    ``threads`` compress, None for one per core.
+    Until `publish` all files have temporary names, see `new_file`; leaving the context removes these. All methods raise
+    `OutputError` with the final name. Pictures (PNG) are kept in memory. ``threads`` compress, None: one per core.
     """
 
     def __init__(

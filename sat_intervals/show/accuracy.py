@@ -8,41 +8,29 @@ import numpy as np
 
 from sat_intervals.evaluate.comparison import Comparison
 from sat_intervals.evaluate.surface_accuracy import Profile, error_map
-from sat_intervals.show.canvas import (
-    DPI,
-    GROUND,
-    INK,
-    MapLayer,
-    PlotFrame,
-    draw_layer,
-    map_size,
-    page,
-    plain_logarithm,
-    say_empty,
-)
+from sat_intervals.show import canvas
 from sat_intervals.show.legend import BLUE, ORANGE
 
-# Cells of a class that are worth a point, and pixels of the longer side of a map.
-_WORTH, _LONGEST = 50, 900
+_WORTH, _LONGEST = 50, 900  # cells of a class that are worth a point, and pixels of the longer side of a map
 
 
-def draw_reliability(report: dict[str, Any], target: Path, name: str, dpi: int = DPI) -> None:
+def draw_reliability(report: dict[str, Any], target: Path, name: str, dpi: int = canvas.DPI) -> None:
     """Draw the half widths of intervals against those that would have been needed, and coverage, by class of them."""
     nominal = report["nominal"]
     kinds = [kind for kind in report["half_width"] if kind["with_interval"] >= _WORTH]
-    with page(target, (9.0, 4.2), dpi, f"{name}: intervals and reference") as figure:
+    with canvas.page(target, (9.0, 4.2), dpi, f"{name}: intervals and reference") as figure:
         left, right = figure.subplots(1, 2)
         stated = [kind["mean_half_width"] for kind in kinds]
         if nominal is not None:
             needed = [kind["needed_half_width"] for kind in kinds]
             left.plot(stated, needed, "o-", color=BLUE, lw=1, ms=5)
             left.set_ylabel(f"|height - reference| of {100 * nominal:g} % of cells (m)")
-            right.axhline(nominal, color=INK, lw=0.8, ls="--", label="nominal")
+            right.axhline(nominal, color=canvas.INK, lw=0.8, ls="--", label="nominal")
         ends = [max(0.05, 0.8 * min(stated, default=0.1)), 1.25 * max(stated, default=10.0)]
-        left.plot(ends, ends, color=INK, lw=0.8, ls="--", label="intervals as wide as needed")
+        left.plot(ends, ends, color=canvas.INK, lw=0.8, ls="--", label="intervals as wide as needed")
         left.set(xlabel="mean half width of intervals (m)", xscale="log", yscale="log")
         for axis in (left.xaxis, left.yaxis):
-            plain_logarithm(axis)
+            canvas.plain_logarithm(axis)
         left.legend(loc="upper left", frameon=False)
         right.bar(range(len(kinds)), [kind["coverage"] for kind in kinds], color=BLUE, width=0.7)
         right.axhline(report["all"]["coverage"] or 0.0, color=ORANGE, lw=1, label="measured, all cells")
@@ -57,21 +45,21 @@ def _limits(kind: dict[str, Any]) -> str:
     return f"{kind['from']:g}+" if kind["to"] is None else f"{kind['from']:g}-{kind['to']:g}"
 
 
-def draw_error_map(given: Comparison, nmad: float, target: Path, dpi: int = DPI) -> None:
+def draw_error_map(given: Comparison, nmad: float, target: Path, dpi: int = canvas.DPI) -> None:
     """Draw height - reference, within three NMAD of 0; large surfaces are sampled."""
     errors, extent = error_map(given, _LONGEST)
     end = max(3 * nmad, 0.1)
-    height, width = map_size(errors.shape, 7.0)
+    height, width = canvas.map_size(errors.shape, 7.0)
     name = f"{given.surface.name} - {given.reference.name}"
     unit, empty = "height - reference (m), red: too high", "no common height"
-    layer = MapLayer("", unit, errors, "RdBu_r", (-end, end), if_empty=empty)
-    with page(target, (width + 1.8, height + 0.8), dpi, name) as figure:
-        draw_layer(figure.subplots(), PlotFrame(*extent, GROUND), layer)
+    layer = canvas.MapLayer("", unit, errors, "RdBu_r", (-end, end), if_empty=empty)
+    with canvas.page(target, (width + 1.8, height + 0.8), dpi, name) as figure:
+        canvas.draw_layer(figure.subplots(), canvas.PlotFrame(*extent, canvas.GROUND), layer)
 
 
-def draw_height_profile(profile: Profile, target: Path, names: Sequence[str], dpi: int = DPI) -> None:
+def draw_height_profile(profile: Profile, target: Path, names: Sequence[str], dpi: int = canvas.DPI) -> None:
     """Draw heights, their intervals and the reference along a line; ``names`` of surface and reference."""
-    with page(target, (11.0, 4.0), dpi, f"{names[0]} and {names[1]} along a line") as figure:
+    with canvas.page(target, (11.0, 4.0), dpi, f"{names[0]} and {names[1]} along a line") as figure:
         chart = figure.subplots()
         chart.fill_between(
             profile.distance, profile.lower, profile.upper, color=BLUE, alpha=0.3, lw=0, label="interval"
@@ -87,4 +75,4 @@ def draw_height_profile(profile: Profile, target: Path, names: Sequence[str], dp
             low, high = np.percentile(known, (0, 100))
             room = max(0.5 * (high - low), 5.0)
             chart.set_ylim(low - room, high + room)
-        say_empty(chart, profile.height, "no height")
+        canvas.say_empty(chart, profile.height, "no height")

@@ -113,10 +113,7 @@ def draw_layer(panel: Axes, frame: PlotFrame, layer: MapLayer) -> Colorbar:
 
 
 def add_histogram(bar: Colorbar, widths: np.ndarray, end: float, step: float) -> None:
-    """Draw the histogram of interval widths, from 0 to ``end``, along the left side of their colour bar.
-
-    Its bins are a multiple of ``step`` wide, its shares of the finite widths are on a logarithmic scale.
-    """
+    """Draw shares of interval widths from 0 to ``end``, in bins of a multiple of ``step``, along their colour bar."""
     known = widths[np.isfinite(widths)]
     if known.size == 0:
         return

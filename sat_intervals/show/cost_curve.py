@@ -36,10 +36,7 @@ class Curve(NamedTuple):
 
 
 def read_curve(results: Results, row: int, column: int) -> Curve:
-    """Match a pixel of the results again, with the pixels around it that support it.
-
-    SGM's aggregation reaches beyond the overlap, so the curve may differ slightly from that of the run.
-    """
+    """Match a pixel again with those that support it; as SGM reaches beyond, the run's curve may differ slightly."""
     results.check_pixel(row, column)
     config = results.config
     overlap = config.tiles.support

@@ -24,10 +24,7 @@ def check_one_pair(runs: Sequence[Path]) -> None:
 
 
 def draw_coverage(runs: Sequence[Path], target: Path, dpi: int = DPI, **judging: Any) -> None:
-    """Draw nominal against measured coverage, and mean width against it, of runs of one pair at several coverages.
-
-    ``judging`` are the arguments of `evaluate_run`. Small dots are deciles of confidence.
-    """
+    """Draw nominal coverage and mean width against measured coverage, of runs of one pair at several coverages."""
     reports = sorted((evaluate_run(run, **judging) for run in runs), key=lambda report: float(report["nominal"]))
     with page(target, (9.0, 4.2), dpi, f"{', '.join(run.name for run in runs)}: intervals and truth") as figure:
         left, right = figure.subplots(1, 2)

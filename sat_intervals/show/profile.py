@@ -21,10 +21,7 @@ _LOW, _BARS = "#d4d4d4", 9
 def draw_profile(
     results: Results, target: Path, row: int, columns: tuple[int, int] | None = None, dpi: int = DPI
 ) -> None:
-    """Draw interval, disparity and truth along a row, low-confidence sections in grey (the paper's figures 5, 7, 8).
-
-    ``row`` counts from 0 at the first row of the results; ``columns`` are the first and last one drawn.
-    """
+    """Draw interval, disparity and truth along a row, low confidence in grey (the paper's figures 5, 7, 8)."""
     first, last = results.check_part(row, columns)
     bands = results.read(Window(row, 0, 1, results.region.width))
     valid = bands.valid
@@ -61,10 +58,7 @@ def _areas(low: np.ndarray) -> np.ndarray:
 
 
 def draw_curve(results: Results, target: Path, row: int, column: int, dpi: int = DPI) -> None:
-    """Draw a pixel's cost curve, its possibility distribution, the cut and the interval (the paper's figures 2, 3).
-
-    The pixel is matched again. The interval that the run wrote is shown below.
-    """
+    """Match a pixel again; draw its costs, possibilities, cut (the paper's figures 2, 3), and the written interval."""
     curve = read_curve(results, row, column)
     pixel = results.read_pixel(row, column)
     title = f"Row {row}, column {column}, {'rejected' if pixel.validity & INVALID else 'valid'}"

@@ -14,15 +14,9 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import BANDS, SURFACE
-from sat_intervals.raster import (
-    Georeferencing,
-    open_image,
-    read_layers,
-    read_place,
-    read_small_image,
-    read_small_layers,
-)
+from sat_intervals.raster import Georeferencing, open_image, read_layers, read_place, read_small_layers
 from sat_intervals.raster.publishing import write_file
+from sat_intervals.raster.windows import read_small_image
 from sat_intervals.results import Run, open_input, open_run
 from sat_intervals.show import styles
 from sat_intervals.tiling import Window
@@ -30,8 +24,7 @@ from sat_intervals.tiling import Window
 _LONGEST = 1024  # pixels, longest side of what percentiles are taken from
 _MULTIPLY = 6  # QGIS' blend mode
 _CHECKED = "Qt::Checked"
-# Rasters with a default style.
-_STYLED = "intervals", "width", "validity", "dsm", "dsm_half_width"
+_STYLED = "intervals", "width", "validity", "dsm", "dsm_half_width"  # rasters with a default style
 
 _LOG = getLogger(__name__)
 
@@ -48,19 +41,16 @@ class Raster:
 
 @dataclass(frozen=True)
 class ProjectLayer:
-    """A layer of the project: group, name and meaning in the list, its raster, and colours.
-
-    ``is_default``: the raster alone gets this style, too; ``blend`` is QGIS' mode over the layers below.
-    """
+    """A layer of the project: group, name and meaning in the list, its raster, and colours."""
 
     group: str
     name: str
     meaning: str
     raster: Raster
     renderer: Element
-    is_default: bool = False
+    is_default: bool = False  # the raster alone gets this style, too
     is_shown: bool = False
-    blend: int = 0
+    blend: int = 0  # QGIS' mode over the layers below
 
 
 def write_project(out: str | Path) -> list[Path]:

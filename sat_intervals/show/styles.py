@@ -19,8 +19,7 @@ VERSION = "3.22.0"
 HEAD = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
 # Sun of the hillshade: north-west, 45 degrees high. Heights are flattened: noise of 0.1 m is steep between small cells.
 _SUN = {"azimuth": "315", "angle": "45", "zfactor": "0.3", "multidirection": "0"}
-# Share of values below the first and above the last colour, in percent.
-_CUT = 2.0
+_CUT = 2.0  # share of values below the first and above the last colour, in percent
 
 
 def colours(band: int, values: np.ndarray, ramp: Sequence[str], *, unit: str = "") -> Element:
@@ -109,7 +108,7 @@ def default_style(renderer: Element) -> bytes:
 def difference(
     source: tuple[str, int, int], place: Georeferencing, shape: tuple[int, int], factor: float = 1.0
 ) -> bytes:
-    """Return a virtual raster of the difference of two bands, times a factor, which GDAL computes when it is read.
+    """Return a virtual raster of the difference of two bands, times a factor.
 
     ``source`` is the name of a raster beside it, the band to subtract from, and that to subtract, counted from 1.
     """

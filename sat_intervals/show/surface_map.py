@@ -4,22 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import SURFACE
-from sat_intervals.raster import is_surface, read_place, read_small_layers, read_tags
-from sat_intervals.show.canvas import (
-    DPI,
-    GROUND,
-    MapLayer,
-    PlotFrame,
-    add_histogram,
-    draw_layer,
-    draw_map,
-    fitting,
-    map_size,
-    page,
-    say_empty,
-)
+from sat_intervals.raster import read_small_layers, read_tags, surface_place
+from sat_intervals.show import canvas
 from sat_intervals.show.legend import limits
 
 _LONGEST = 5.5  # inches of the longer side of a map
@@ -31,31 +18,27 @@ _NO_DATA = "#a8c4dd"
 _MOST, _TIMES = 98, 12
 
 
-def draw_surface(surface: Path, target: Path, dpi: int = DPI) -> None:
+def draw_surface(surface: Path, target: Path, dpi: int = canvas.DPI) -> None:
     """Draw hillshade, height, interval width and confidence, or agreement of runs, from the overviews."""
-    shape, place = read_place(surface)
-    if not is_surface(surface):
-        raise SatIntervalsError(f"{surface} is not a surface model of sat-intervals dsm: move it or make it again")
+    shape, place = surface_place(surface)
     assert place.crs is not None
-    assert place.transform is not None
-    assert place.pixel_size is not None
-    inches = map_size(shape, _LONGEST)
-    drawn = fitting(shape, inches, dpi)
+    inches = canvas.map_size(shape, _LONGEST)
+    drawn = canvas.fitting(shape, inches, dpi)
     bands = dict(zip((band.name for band in SURFACE), read_small_layers(surface, drawn), strict=True))
     height = bands["height"].astype(np.float64)
     halves = (bands["height_upper"] - bands["height_lower"]) / 2
     across, down = place.pixel_size[0] * shape[1] / drawn[1], place.pixel_size[1] * shape[0] / drawn[0]
-    left, top = place.transform.c, place.transform.f
+    left, top = place.affine.c, place.affine.f
     ends = left + shape[1] * place.pixel_size[0], top - shape[0] * place.pixel_size[1]
-    frame = PlotFrame(left, *ends, top, GROUND)
+    frame = canvas.PlotFrame(left, *ends, top, canvas.GROUND)
     middle, end = _middle_and_end(halves)
     layers = [
-        MapLayer("Height", "m", height, "viridis", limits(height)),
-        MapLayer("Half width of the interval", "m", halves, "magma", (0, end), 0.5),
-        MapLayer("Agreement of runs", "1 where intervals overlap", bands["agreement"], "cividis", (0, 1)),
+        canvas.MapLayer("Height", "m", height, "viridis", limits(height)),
+        canvas.MapLayer("Half width of the interval", "m", halves, "magma", (0, end), 0.5),
+        canvas.MapLayer("Agreement of runs", "1 where intervals overlap", bands["agreement"], "cividis", (0, 1)),
     ]
     if not np.isfinite(bands["agreement"]).any():
-        layers[2] = MapLayer("Confidence", "0 to 1", bands["confidence"], "cividis", (0, 1))
+        layers[2] = canvas.MapLayer("Confidence", "0 to 1", bands["confidence"], "cividis", (0, 1))
     layers = [layer for layer in layers if np.isfinite(layer.values).any()]
     step = "" if drawn == shape else f", {drawn[0]} x {drawn[1]} of them drawn"
     filled = f"{100 * np.isfinite(height).mean():.1f} % filled"
@@ -64,16 +47,18 @@ def draw_surface(surface: Path, target: Path, dpi: int = DPI) -> None:
         f"{surface.name}: {shape[0]} x {shape[1]} cells of {place.pixel_size[0]:g} m{step}, {filled}{middle}\n"
         f"{f'EPSG:{code}' if code else place.crs.to_string()[:60]}, heights {read_tags(surface).get('HEIGHTS', '')}"
     )
-    with page(target, (2 * (inches[1] + 1.4), 2 * (inches[0] + 0.7) + 0.3), dpi, caption) as figure:
+    with canvas.page(target, (2 * (inches[1] + 1.4), 2 * (inches[0] + 0.7) + 0.3), dpi, caption) as figure:
         first, *panels = figure.subplots(2, 2).ravel()
         relief = _relief(height, across, down)
-        draw_map(first, frame, relief, "Hillshade, sun in the north-west; blue: no data", cmap="gray", vmin=0, vmax=1)
-        say_empty(first, relief, "no value")
+        canvas.draw_map(
+            first, frame, relief, "Hillshade, sun in the north-west; blue: no data", cmap="gray", vmin=0, vmax=1
+        )
+        canvas.say_empty(first, relief, "no value")
         first.set_facecolor(_NO_DATA)  # flat ground is grey too
         for panel, layer in zip(panels, layers, strict=False):
-            bar = draw_layer(panel, frame, layer)
+            bar = canvas.draw_layer(panel, frame, layer)
             if layer.values is halves:
-                add_histogram(bar, halves, end, step=end / 40)
+                canvas.add_histogram(bar, halves, end, step=end / 40)
         for panel in panels[len(layers) :]:
             panel.remove()
 

@@ -9,7 +9,7 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.dsm import check_sensors, checked_cells, make_surface, surface_tags
 from sat_intervals.heights.geometry import geometry_warnings, set_geometry
-from sat_intervals.heights.rectified import IMAGES, rectified_files
+from sat_intervals.heights.rectify import IMAGES, rectified_files
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, check_not_replaced, files_of, open_image
 from sat_intervals.run.pair import match_pair

@@ -81,15 +81,8 @@ def scenes(draw):
         truth=truth,
     )
     depth, kernel = draw(st.integers(0, 3)), draw(st.sampled_from([1, 3, 5]))
-    criteria = Criteria(
-        minimum,
-        maximum,
-        0.6,
-        kernel,
-        depth,
-        draw(st.sampled_from([0.0, 0.25])),
-        nominal=draw(st.sampled_from([None, 0.9])),
-    )
+    tolerance, nominal = draw(st.sampled_from([0.0, 0.25])), draw(st.sampled_from([None, 0.9]))
+    criteria = Criteria(minimum, maximum, 0.6, kernel, depth, tolerance, nominal=nominal)
     return scene, criteria, draw(st.lists(st.integers(1, 5), max_size=6))
 
 
@@ -197,9 +190,8 @@ def read(path):
 def scene_of(out, truth):
     disparity, lower, upper, confidence = read(out / "intervals.tif")
     valid = read(out / "validity.tif")[0] & INVALID == 0
-    return SimpleNamespace(
-        disparity=disparity, lower=lower, upper=upper, confidence=confidence, valid=valid, truth=truth
-    )
+    bands = {"disparity": disparity, "lower": lower, "upper": upper, "confidence": confidence}
+    return SimpleNamespace(**bands, valid=valid, truth=truth)
 
 
 def criteria_of(out, tolerance=0.0):
@@ -293,11 +285,7 @@ PAIR = "left,right,truth,minimum,maximum"
         ("meta.json", "3", "meta.json holds int"),
         ("meta.json", '{"disparity": [1]}', r"disparity is \[1\], needed: \[minimum, maximum\]"),
         ("other", "", "meta.json missing; a pair is a folder of left.tif, right.tif, truth.tif, meta.json"),
-        (
-            "pairs.csv",
-            "left,right,minimum,maximum\na,b,1,2\n",
-            "row 1 lacks truth: give a list of pairs, each with left",
-        ),
+        ("pairs.csv", "left,right,minimum,maximum\na,b,1,2\n", "row 1 lacks truth: give a list of pairs, each with"),
         ("pairs.csv", f"{PAIR}\n", "pairs.csv holds no pairs: give a list of pairs, each with left, right"),
         ("pairs.csv", f"{PAIR},name\na,b,c,1,2,x\n./a,b,c,1,2,y\n", "/a is given 2 times: give it once"),
         ("pairs.csv", f"{PAIR}\na,b,c,1,x\n", "row 1: maximum is 'x': input should be a valid integer"),
@@ -358,18 +346,6 @@ def test_command__advises_to_remove_a_bias(run, pair, tmp_path):
     assert "try --remove-bias" in said
 
 
-def test_command__prints_the_form_of_json(run):
-    status, text, _ = command("evaluate", run, "--json")
-    report = json.loads(text)
-    assert status == 0
-    assert report == json.loads(json.dumps(evaluate_run(run)))
-    assert set(report["all"]) == set(report["high"]) == {
-        "count", "accuracy", "relative_size", "mean_width", "median_width", "interval_score"
-    }  # fmt: skip
-    assert set(report["low"]) == {*report["all"], "relative_overestimation"}
-    assert {"bad1", "bad3", "deciles", "with_rejected", "tolerance", "bias"} < set(report)
-
-
 def test_command__prints_one_run(run, pair):
     status, text, _ = command("evaluate", run, "--truth", pair / "truth.tif", "--tolerance", "0.25", "--remove-bias")
     assert status == 0
@@ -401,10 +377,8 @@ def test_command__matches_pairs_and_prints_a_table(pair, run, tmp_path):
     )
     status, text, shown = command("evaluate", tmp_path / "pairs.csv", run, "--preset", "paper", "--json")
     assert status == 0
-    assert [line for line in shown.splitlines() if not line.startswith("sat-intervals: ")] == [
-        "matching one",
-        "matching two",
-    ]
+    lines = [line for line in shown.splitlines() if not line.startswith("sat-intervals: ")]
+    assert lines == ["matching one", "matching two"]
     reports = json.loads(text)
     assert list(reports) == ["one", "two", str(run)]
     assert reports["one"] == reports[str(run)]

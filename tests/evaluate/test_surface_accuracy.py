@@ -296,7 +296,7 @@ def test_evaluate_command__what_it_cannot_use_gets_one_line(tmp_path):
         (["--dsm", tmp_path / "none.tif", "--reference", away], "none.tif"),
         (["--dsm", model, "--reference", away], "give a reference of the same place"),
         (["--dsm", model, "--reference", nowhere], "has no CRS or is not north up"),
-        (["--dsm", feet, "--reference", model], "is not a surface model of sat-intervals dsm: is it the --reference?"),
+        (["--dsm", feet, "--reference", model], "is not a surface model of sat-intervals dsm: give one"),
         (["--dsm", model, "--reference", feet], "differ by 500 m or more in the median: check that both are metres"),
         (["--dsm", model, "--reference", feet, "--tolerance", "5"], "--tolerance applies to runs and pairs, not to"),
     ):

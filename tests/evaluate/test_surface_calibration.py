@@ -14,13 +14,8 @@ from sat_intervals import SatIntervalsError
 from sat_intervals.config import load_height_calibration
 from sat_intervals.evaluate.surface_calibration import calibrate_surface
 
-TAGS = {
-    "INTERVAL": "median",
-    "RADIUS": "1 m",
-    "COVERAGE": "0.9",
-    "RUNS": "2026",
-    "HEIGHTS": "above the WGS 84 ellipsoid",
-}
+TAGS = {"INTERVAL": "median", "RADIUS": "1 m", "COVERAGE": "0.9", "RUNS": "2026"}
+TAGS |= {"HEIGHTS": "above the WGS 84 ellipsoid"}
 
 
 def scene(folder, seed=0, rows=120, columns=150, scale=1.0):

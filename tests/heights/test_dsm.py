@@ -143,12 +143,6 @@ def test_make_surface__leaves_out_points_beside_missing_data_without_confidence(
     assert (report["border"], report["points"]) == (12, x.size - 12)
 
 
-def test_make_surface__of_a_run_that_was_moved(tmp_path):
-    out = write_points(tmp_path / "a", [0.5], [-0.5], [100.0])
-    out.rename(tmp_path / "moved")
-    make_surface([tmp_path / "moved"], tmp_path / "moved" / "dsm.tif", resolution=1.0)
-
-
 def test_make_surface__keeps_the_surface_whose_grid_it_takes(tmp_path):
     out = write_points(tmp_path / "a", [0.5, 3.5], [-0.5, -0.9], [10, 14])
     surface_of([out], tmp_path)
@@ -190,10 +184,8 @@ def test_make_surface__of_runs_that_do_not_meet_has_a_height_that_one_of_them_ha
     random = np.random.default_rng(4)
     x, y = np.meshgrid(np.arange(0.5, 30), -np.arange(0.5, 20))
     heights, halves = random.uniform(0, 60, (3, *x.shape)), random.uniform(0.5, 4, (3, *x.shape))
-    runs = [
-        write_points(tmp_path / str(k), x, y, *given)
-        for k, given in enumerate(zip(heights, halves, halves, strict=True))
-    ]
+    given = zip(heights, halves, halves, strict=True)
+    runs = [write_points(tmp_path / str(number), x, y, *one) for number, one in enumerate(given)]
     surface, place, _ = surface_of(runs, tmp_path, radius=0.1)
     i, j = cell_of(place, LEFT + x, TOP + y)
     apart = surface[BAND["agreement"], i, j] == 0
@@ -282,9 +274,8 @@ def test_make_surface__outliers_are_left_out_and_counted(tmp_path):
 
 
 def test_make_surface__poor_cells_are_no_data(tmp_path):
-    out = write_points(
-        tmp_path / "a", [0.5, 5.5, 9.5], [-0.5] * 3, [10.0] * 3, upper=[[2, 9, 2]], confidence=[[0.9, 0.9, 0.2]]
-    )
+    given = {"upper": [[2, 9, 2]], "confidence": [[0.9, 0.9, 0.2]]}
+    out = write_points(tmp_path / "a", [0.5, 5.5, 9.5], [-0.5] * 3, [10.0] * 3, **given)
     choices = SurfaceChoices(max_width=5, min_confidence=0.5)
     surface, place, report = surface_of([out], tmp_path, radius=0.6, choices=choices)
     i, j = cell_of(place, LEFT, TOP)
@@ -468,9 +459,7 @@ def test_projection__refuses_what_is_no_map_in_metres(crs, message):
 def test_projection__refuses_a_map_of_another_place(crs):
     Projection("EPSG:32632").check(7.2, 43.6)
     Projection("EPSG:32631").check(7.2, 43.6)
-    with pytest.raises(
-        SatIntervalsError, match=r"is for longitudes .* the points are at longitude 7\.20, latitude 43\.60"
-    ):
+    with pytest.raises(SatIntervalsError, match=r"longitudes .* the points are at longitude 7\.20, latitude 43\.60"):
         Projection(crs).check(7.2, 43.6)
 
 

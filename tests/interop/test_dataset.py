@@ -70,7 +70,7 @@ def test_open_surface__has_the_heights_their_place_and_their_datum(made, tmp_pat
     assert surface["height"].attrs["standard_name"] == "height_above_geopotential_datum"
     assert (float(surface["x"][0]), float(surface["y"][0])) == (SURFACE_PLACE.c + 0.5, SURFACE_PLACE.f - 0.5)
     assert "UTM zone 31N" in surface["spatial_ref"].attrs["crs_wkt"]
-    with pytest.raises(SatIntervalsError, match="has not the bands of a surface model"):
+    with pytest.raises(SatIntervalsError, match="is not a surface model"):
         sat_intervals.open_surface(made[1] / "intervals.tif")
 
 

@@ -110,9 +110,3 @@ def test_export__replaces_files_with_overwrite_only(run, tmp_path):
     assert invoke("export", run[0], tmp_path, "--to", "otb", "--overwrite").exit_code == 0
     with rasterio.open(tmp_path / "mask.tif") as dataset:
         assert dataset.tags()["EXPORT"] == "otb"
-
-
-def test_export__refuses_what_is_no_run(tmp_path):
-    result = invoke("export", tmp_path, "to", "--to", "cars")
-    assert (result.exit_code, result.stderr.count("\n")) == (2, 1)
-    assert "give the folder of a finished run" in result.stderr

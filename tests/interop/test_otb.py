@@ -89,7 +89,7 @@ def surfaced(otb, tmp_path_factory):
 def test_guide__epipolar_images_and_grids_of_otb_fit_to_a_fraction_of_a_pixel(surfaced):
     from scipy.ndimage import map_coordinates
 
-    from sat_intervals.heights.grids import read_grid
+    from sat_intervals.heights.sensors import read_grid
     from sat_intervals.raster import open_image
 
     _, folder = surfaced

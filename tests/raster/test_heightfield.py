@@ -5,6 +5,7 @@ import pytest
 import rasterio
 from numpy.testing import assert_allclose, assert_array_equal
 from rasterio.transform import Affine
+from surfaces import write_geoid
 
 from sat_intervals import SatIntervalsError
 from sat_intervals.raster import HeightRaster, Vertical
@@ -33,17 +34,13 @@ def test_height_raster__positions_are_those_of_cells(tmp_path):
 
 
 def test_height_raster__takes_a_geoid_and_a_foot(tmp_path):
-    with rasterio.open(
-        tmp_path / "geoid.tif", "w", driver="GTiff", height=4, width=4, count=1, dtype="float32", crs="EPSG:4326",
-        transform=Affine(1, 0, 0, 0, -1, 46),
-    ) as grid:  # fmt: skip
-        grid.write(np.full((1, 4, 4), 47.5, np.float32))
+    geoid = Vertical(geoid=write_geoid(tmp_path / "geoid.tif", 47.5))
     path = write(tmp_path / "a.tif", np.zeros((5, 7), np.float32))
-    raster = HeightRaster(path, None, Vertical(geoid=tmp_path / "geoid.tif"))
+    raster = HeightRaster(path, None, geoid)
     assert raster.frame.to_ellipsoid(370_011.0, 4_829_993.0, np.array(100.0))[2] == pytest.approx(147.5, abs=1e-3)
     with pytest.raises(SatIntervalsError, match=r"geoid.tif has no geoid height at longitude 9.00, latitude 43.00"):
         raster.frame.check(9.0, 43.0)
-    feet = HeightRaster(path, "EPSG:32631+6360", Vertical(geoid=tmp_path / "geoid.tif"))  # US survey feet
+    feet = HeightRaster(path, "EPSG:32631+6360", geoid)  # US survey feet
     assert feet.frame.to_ellipsoid(370_011.0, 4_829_993.0, np.array(100.0))[2] == pytest.approx(77.98, abs=1e-2)
 
 
@@ -81,7 +78,7 @@ def test_height_raster__says_what_is_missing(tmp_path):
     for path, crs, message in (
         (write(tmp_path / "a.tif", heights), None, "a.tif does not say what its heights refer to: give --ellipsoid"),
         (write(tmp_path / "b.tif", heights, crs=None), None, "b.tif has no CRS: give it with --crs"),
-        (write(tmp_path / "c.tif", heights, crs=local), None, "is a local one: give one of the Earth with --crs"),
+        (write(tmp_path / "c.tif", heights, crs=local), None, "is a local one: give one of the Earth"),
         (write(tmp_path / "d.tif", heights, place=Affine.identity()), None, "d.tif has no transform"),
         (write(tmp_path / "e.tif", heights[:1]), None, "e.tif has 1 x 7 cells: give at least 2 x 2"),
         (tmp_path / "a.tif", "EPSG:32631+5773", "has heights of EGM96 height: give the grid of this geoid with"),

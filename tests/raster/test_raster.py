@@ -23,22 +23,10 @@ from rasterio.transform import Affine
 
 from sat_intervals.errors import InputError
 from sat_intervals.products import BANDS, FLAGS, INVALID, MASKED, NO_DATA
-from sat_intervals.raster import (
-    RUN_FILES,
-    File,
-    Georeferencing,
-    Image,
-    OutputError,
-    OutputWriter,
-    check_pair,
-    gdal,
-    open_image,
-    points_file,
-    read_window,
-)
-from sat_intervals.raster.georeferencing import horizontal_name
+from sat_intervals.raster import RUN_FILES, File, Georeferencing, Image, OutputError, OutputWriter, gdal, points_file
+from sat_intervals.raster.images import check_pair, open_image
 from sat_intervals.raster.projection import utm_of
-from sat_intervals.raster.windows import kept_view, restored_view
+from sat_intervals.raster.windows import kept_view, read_window, restored_view
 from sat_intervals.tiling import View, Window
 
 UTM = {"crs": "EPSG:32631", "transform": Affine(0.5, 0, 360000.1, 0, -0.5, 4800000.3)}
@@ -85,9 +73,8 @@ def make(path: Path, bands, *, internal=None, alpha=None, external=None, **optio
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         with rasterio.open(path, "w", driver="GTiff", **shape, **options) as dataset:
             if alpha is not None:
-                dataset.colorinterp = [
-                    ColorInterp.alpha if band == alpha else ColorInterp.gray for band in dataset.indexes
-                ]
+                colours = ColorInterp.gray, ColorInterp.alpha
+                dataset.colorinterp = [colours[band == alpha] for band in dataset.indexes]
             dataset.write(bands)
             for mask in (internal, external):
                 if mask is not None:
@@ -287,13 +274,10 @@ def test_read_window__takes_nan_and_infinity_for_no_data(tmp_path):
     [
         ("uint8", 255, [255, 254, 0], [0, 1, 1]),
         ("uint8", -9999, [241, 0, 255], [1, 1, 1]),  # -9999 modulo 256 is 241
-        ("uint8", 256, [0, 1, 255], [1, 1, 1]),
         ("uint8", 0.5, [0, 1, 2], [1, 1, 1]),
         ("uint8", float("nan"), [0, 1, 2], [1, 1, 1]),
         ("int16", -9999, [-9999, 9999, 0], [0, 1, 1]),
         ("float32", 0.1, [0.1, 0.25, 0], [0, 1, 1]),
-        ("float32", -3.4e38, [-3.4e38, 1, 2], [0, 1, 1]),
-        ("float32", -3.4028234663852886e38, [-3.4028234663852886e38, 1, 2], [0, 1, 1]),
         ("float32", -3.402823e38, [-3.4028234663852886e38, -1e38, 2], [0, 1, 1]),  # as people write it
         ("float32", -3.4e38, [-3.4028234663852886e38, -3.3e38, 2], [0, 1, 1]),
         ("float32", 9.96921e36, [9.969209968386869e36, 9.97e36, 0], [0, 1, 1]),
@@ -636,10 +620,6 @@ def test_check_pair__takes_crs_that_differ_only_in_their_heights(tmp_path):
     check_pair(images[0], images[1], 1)
     with pytest.raises(InputError, match="different CRS"):
         check_pair(images[0], images[2], 1)
-
-
-def test_horizontal_name__is_the_code_of_a_compound_crs():
-    assert horizontal_name(rasterio.crs.CRS.from_user_input("EPSG:32719+5773")) == "EPSG:32719"
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,8 @@ from pyproj import Transformer
 from rasterio.transform import Affine
 from surfaces import PLACE, write_raster
 
-from sat_intervals.raster import Georeferencing, covered_window
-from sat_intervals.raster.surfaces import read_heights
+from sat_intervals.raster import Georeferencing
+from sat_intervals.raster.surfaces import covered_window, read_heights
 from sat_intervals.tiling import Window
 
 GRID = Georeferencing(crs="EPSG:32631", transform=PLACE)
@@ -33,9 +33,8 @@ def test_covered_window__is_the_part_inside_the_extent_of_the_raster(tmp_path, p
 def test_covered_window__in_degrees_is_at_most_some_cells_larger(tmp_path):
     # 40 cells of 1e-5 degrees: 32 m to the east and 44 m to the south of the middle.
     place = Affine(1e-5, 0, LONGITUDE, 0, -1e-5, LATITUDE)
-    found = covered_window(
-        write_raster(tmp_path / "reference.tif", [np.zeros((40, 40))], place, "EPSG:4326"), GRID, (200, 300)
-    )
+    reference = write_raster(tmp_path / "reference.tif", [np.zeros((40, 40))], place, "EPSG:4326")
+    found = covered_window(reference, GRID, (200, 300))
     np.testing.assert_allclose((found.row, found.column, found.height, found.width), (100, 100, 44, 32), atol=4)
 
 

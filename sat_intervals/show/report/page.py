@@ -18,8 +18,7 @@ from sat_intervals.results import Results
 from sat_intervals.show.legend import PIXEL_CLASSES, class_counts
 from sat_intervals.show.report.contents import Histograms, Pixels
 
-# Rows and columns of a surface that are read.
-_CELLS = 1000
+_CELLS = 1000  # rows and columns of a surface that are read
 
 
 def write_report(results: Results) -> Path:
@@ -68,7 +67,6 @@ def _surface(results: Results) -> dict[str, Any] | None:
     if not results.has_current("dsm.tif"):
         return None
     (rows, columns), place = read_place(results.out / "dsm.tif")
-    assert place.pixel_size is not None
     small = -(-rows // max(1, rows // _CELLS)), -(-columns // max(1, columns // _CELLS))
     height, lower, upper = read_small_layers(results.out / "dsm.tif", small)[:3].astype(np.float64)
     known, halves = np.isfinite(height), (upper - lower)[np.isfinite(lower)] / 2

@@ -59,7 +59,7 @@ def test_read_grid__displacements_give_the_points_of_positions(run, tmp_path):
 
 
 def test_read_grid__coordinates_without_a_transform_begin_at_the_corner_of_the_first_pixel(tmp_path):
-    from sat_intervals.heights.grids import read_grid
+    from sat_intervals.heights.sensors import read_grid
 
     positions = grid(tmp_path / "positions.tif", *SHAPE)
     otb = displacements(tmp_path / "otb.tif", positions, Affine.identity(), METADATATYPE="OTB")
