@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 
 import click
 
-from sat_intervals.cli.calibration_files import check_output, write
 from sat_intervals.cli.logs import warn
 from sat_intervals.cli.options import Surface, say_json
 
@@ -31,13 +30,14 @@ def calibrate_heights(
 ) -> None:
     """Calibrate the intervals of a surface model, and write and print their margins."""
     from sat_intervals.evaluate.surface_calibration import calibrate_surface
-    from sat_intervals.raster.identity import check_not_replaced
+    from sat_intervals.raster import check_not_replaced
+    from sat_intervals.workflows.calibrate import check_output, write_commented
 
     files = surface.dsm, surface.reference
     check_not_replaced(files, [output])
     check_output(output, overwrite=overwrite)
     calibration = calibrate_surface(*files, name or output.stem, coverage=coverage, registers=surface.registers)
-    write(output, _HEIGHTS, calibration.model_dump(mode="json"))
+    write_commented(output, _HEIGHTS, calibration.model_dump(mode="json"))
     if as_json:
         say_json(calibration.model_dump(mode="json"))
     elif not quiet:

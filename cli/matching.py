@@ -35,11 +35,6 @@ class PairArguments:
     bands: tuple[int | None, int | None]
     window: "Window | None"
 
-    @property
-    def files(self) -> list[str]:
-        """Return images and masks."""
-        return [*self.images, *filter(None, self.masks)]
-
     def open(self) -> "tuple[Image, Image]":
         """Open both images."""
         from sat_intervals.raster import open_image

@@ -1,5 +1,6 @@
 """Options shared by commands, and checks of file names."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import wraps
@@ -73,6 +74,20 @@ truth_option = click.option(
     "--truth", type=FILE, help="True disparity; default truth.tif beside the left image, if it exists."
 )
 
+
+def _finite(context: click.Context, parameter: click.Parameter, value: float) -> float:
+    """Raise if a number of pixels is infinite or NaN, which no range of click refuses."""
+    if not math.isfinite(value):
+        raise click.BadParameter(f"{value} is not a number of pixels")
+    return value
+
+
+TOLERANCE: dict[str, Any] = {"type": click.FloatRange(min=0), "default": 0.0, "callback": _finite, "metavar": "PX"}
+tolerance_option = click.option(
+    "--tolerance",
+    **TOLERANCE,
+    help="Truth up to PX outside an interval counts as inside; for quantised truth, give half a step.",
+)
 
 SensorFiles = tuple[Path, Path, Path, Path]
 """Left and right RPC model, left and right epipolar grid."""

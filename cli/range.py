@@ -27,36 +27,17 @@ def search_range(pair: PairArguments, output: Path | None, overwrite: bool, as_j
     that of the whole images.
     """
     from sat_intervals.cli.console import Console
-    from sat_intervals.config import load_config
-    from sat_intervals.prepare.local import write_ranges
-    from sat_intervals.prepare.pair import FilePair
-    from sat_intervals.prepare.prepared import prepare
-    from sat_intervals.prepare.search_range import undeclared_lines
-    from sat_intervals.raster import files_of
-    from sat_intervals.raster.identity import check_not_replaced
-    from sat_intervals.raster.publishing import check_free
-    from sat_intervals.run.each import each_here
-    from sat_intervals.run.quality import rows_left
+    from sat_intervals.run.preparing import range_of_pair
 
     with Console(quiet or as_json) as console:
         left, right = pair.open()
-        if output:
-            names = pair.files
-            check_not_replaced([file for name in names for file in (name, *files_of(name))], [output])
-            check_free(output, overwrite=overwrite)
-        with each_here(console.progress) as each:
-            prepared = prepare(FilePair(left, right), load_config({"rows": "none"}), each)
-        found, survey = prepared.search, prepared.survey
-        assert found  # nothing was given
-        assert survey
-        if output:
-            write_ranges(output, found.local, left)
+        found, survey, warnings = range_of_pair(left, right, output, overwrite=overwrite, progress=console.progress)
     if as_json:
         say_json(found.report() | {"survey": survey.report()})
         return
     for name, value in [*_rows(found), *_survey(survey)]:
         click.echo(f"{name:<36}{value}")
-    warn([*undeclared_lines(found.undeclared, pair.images), *rows_left(survey, "auto", pair.images[1])])
+    warn(warnings)
 
 
 def _rows(found: Any) -> list[tuple[str, str]]:

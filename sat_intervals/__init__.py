@@ -25,6 +25,7 @@ if typing.TYPE_CHECKING:
     from sat_intervals.raster import open_image
     from sat_intervals.run.pair import match_pair
     from sat_intervals.tiling import Window
+    from sat_intervals.workflows.calibrate import calibrate
     from sat_intervals.workflows.rectify import rectify
     from sat_intervals.workflows.surface import surface
 
@@ -37,6 +38,7 @@ __all__ = [
     "SurfaceChoices",
     "Window",
     "__version__",
+    "calibrate",
     "calibrate_surface",
     "calibrate_volumes",
     "decode_flags",
@@ -66,6 +68,7 @@ _HOMES = {
     "SatIntervalsError": "errors",
     "SurfaceChoices": "heights.choices",
     "Window": "tiling",
+    "calibrate": "workflows.calibrate",
     "calibrate_surface": "evaluate.surface_calibration",
     "calibrate_volumes": "match.calibrate_volumes",
     "decode_flags": "interop.dataset",

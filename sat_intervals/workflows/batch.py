@@ -16,7 +16,6 @@ from sat_intervals.config.presets import merged
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.dsm import check_sensors
-from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, OutputError, files_of, open_image
 from sat_intervals.raster.identity import check_not_replaced
@@ -28,6 +27,7 @@ from sat_intervals.run.job import Job, open_job
 from sat_intervals.run.pair import (
     Matched,
     check_failures,
+    compile_for,
     complete_before,
     match_and_assemble,
     match_jobs,
@@ -227,7 +227,7 @@ def _matched(
     if not jobs:
         return
     for job in jobs.values():
-        compile_kernels(job.config)
+        compile_for(job)
     assembling: dict[Future[dict[str, Any]], str] = {}
     with _thread() as (thread, check):
         names = {id(job): name for name, job in jobs.items()}
