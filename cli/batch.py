@@ -7,11 +7,11 @@ import click
 
 from sat_intervals.cli.logs import warn
 from sat_intervals.cli.matching import RunArguments, SettingsArguments, run_options, settings_options
-from sat_intervals.cli.options import FILE, json_option, say_json
+from sat_intervals.cli.options import FILE, Grouped, json_option, say_json
 from sat_intervals.cli.rectify import say_rectified
 
 
-@click.command(short_help="Match many pairs; a rerun matches the missing ones.")
+@click.command(cls=Grouped, short_help="Match many pairs; a rerun matches the missing ones.")
 @click.argument("pairs", type=FILE)
 @click.argument("out", type=FILE)
 @json_option

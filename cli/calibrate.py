@@ -10,6 +10,7 @@ from sat_intervals.cli.calibrate_dsm import calibrate_heights
 from sat_intervals.cli.matching import SettingsArguments, settings_options
 from sat_intervals.cli.options import (
     FILE,
+    Grouped,
     Surface,
     json_option,
     log_options,
@@ -21,7 +22,7 @@ from sat_intervals.cli.options import (
 )
 
 
-@click.command(short_help="Find the levels that reach a coverage, on pairs with known truth.")
+@click.command(cls=Grouped, short_help="Find the levels that reach a coverage, on pairs with known truth.")
 @click.argument("pairs", nargs=-1, type=FILE)
 @click.option("--output", type=FILE, required=True, help="Calibration to write (YAML).")
 @overwrite_option

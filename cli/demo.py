@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from sat_intervals.cli.matching import RunArguments, SettingsArguments, run_options, settings_options
-from sat_intervals.cli.options import FILE, json_option, say_json
+from sat_intervals.cli.options import FILE, Grouped, json_option, say_json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from sat_intervals.raster import Georeferencing
 
 
-@click.command(short_help="Make a scene with exact truth, match it and compare.")
+@click.command(cls=Grouped, short_help="Make a scene with exact truth, match it and compare.")
 @click.argument("out", type=FILE)
 @click.option(
     "--size", type=int, nargs=2, metavar="ROWS COLUMNS", default=(1200, 1200), show_default=True, help="Size in pixels."

@@ -11,7 +11,9 @@ from sat_intervals.cli.logs import warn
 from sat_intervals.cli.options import (
     FILE,
     Command,
+    Grouped,
     SensorFiles,
+    expert_option,
     json_option,
     log_options,
     note_geometry,
@@ -30,35 +32,35 @@ _CELL_OPTIONS = (
     click.option("--resolution", type=float, metavar="METRES", help="Side of a cell; or give --grid-like."),
     click.option("--grid-like", type=FILE, help="North-up raster whose grid and CRS the surface takes."),
     click.option("--crs", metavar="EPSG", help="A projected CRS in metres; default the UTM zone of the points."),
-    click.option("--radius", type=float, metavar="METRES", help="Reach of a point; default the side of a cell."),
+    expert_option("--radius", type=float, metavar="METRES", help="Reach of a point; default the side of a cell."),
     click.option("--geoid", type=FILE, help="Geoid grid (GTX, GeoTIFF) that heights refer to."),
-    click.option(
+    expert_option(
         "--bounds",
         type=click.Choice(("envelope", "median")),
         help="Interval of a cell: medians of its points' bounds (default for runs with a coverage), or the envelope of "
         "their intervals (default for others).",
     ),
-    click.option(
+    expert_option(
         "--keep-border",
         "keeps_border",
         is_flag=True,
         help="Keep points of confidence below 0.1 beside missing data of the right image.",
     ),
-    click.option(
+    expert_option(
         "--keep-open/--drop-open",
         "keeps_open",
         default=None,
         help="Keep or leave out points whose interval is open at an end of the search range; default: leave out with a "
         "coverage, else keep.",
     ),
-    click.option(
+    expert_option(
         "--outliers",
         type=float,
         metavar="METRES",
         help="Leave out points farther than this from the median height within 2 pixels; default: none.",
     ),
-    click.option("--max-width", type=float, metavar="METRES", help="Leave out cells with a wider interval."),
-    click.option("--min-confidence", type=float, metavar="C", help="Leave out cells of lower confidence, 0 to 1."),
+    expert_option("--max-width", type=float, metavar="METRES", help="Leave out cells with a wider interval."),
+    expert_option("--min-confidence", type=float, metavar="C", help="Leave out cells of lower confidence, 0 to 1."),
 )
 
 
@@ -128,7 +130,7 @@ def say_surface(console: "Console", report: dict[str, Any]) -> None:
     )
 
 
-@click.command(short_help="Make a surface model with height intervals from one or several runs.")
+@click.command(cls=Grouped, short_help="Make a surface model with height intervals from one or several runs.")
 @click.argument("outs", metavar="OUT...", nargs=-1, required=True, type=FILE)
 @cell_options
 @calibration_option("--calibration")

@@ -10,6 +10,7 @@ from sat_intervals.cli.logs import warn
 from sat_intervals.cli.matching import SettingsArguments, settings_options
 from sat_intervals.cli.options import (
     FILE,
+    Grouped,
     Surface,
     json_option,
     log_options,
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 _BIAS = 0.25
 
 
-@click.command(short_help="Evaluate intervals against a known truth.")
+@click.command(cls=Grouped, short_help="Evaluate intervals against a known truth.")
 @click.argument("folders", metavar="OUT...", nargs=-1, type=FILE)
 @click.option("--truth", "truths", type=FILE, multiple=True, help="True disparity; one for each OUT, in that order.")
 @click.option(

@@ -12,14 +12,14 @@ from sat_intervals.cli.matching import (
     run_options,
     search_options,
 )
-from sat_intervals.cli.options import FILE, json_option, say_json
+from sat_intervals.cli.options import FILE, Grouped, expert_option, json_option, say_json
 
 
-@click.command(short_help="Match a pair: disparity, interval, confidence, validity.")
+@click.command(cls=Grouped, short_help="Match a pair: disparity, interval, confidence, validity.")
 @search_options
 @pair_options
 @click.argument("out", type=FILE)
-@click.option("--dry-run", is_flag=True, help="Print the job script of the cluster; submit nothing.")
+@expert_option("--dry-run", is_flag=True, help="Print the job script of the cluster; submit nothing.")
 @json_option
 @run_options
 def match(

@@ -13,6 +13,7 @@ from sat_intervals.cli.options import (
     NAME,
     PRESETS,
     Command,
+    expert_option,
     gathered,
     log_options,
     quiet_option,
@@ -144,7 +145,7 @@ image_options = gathered(
         metavar="V",
         help="No-data value of both images, or LEFT,RIGHT; replaces that of the files.",
     ),
-    click.option("--band", type=_Both(int), metavar="N", help="Band to match in both images, or LEFT,RIGHT."),
+    expert_option("--band", type=_Both(int), metavar="N", help="Band to match in both images, or LEFT,RIGHT."),
 )
 
 
@@ -159,7 +160,7 @@ def pair_options(command: Command) -> Command:
 _LEVEL_OPTIONS = (
     click.option("--coverage", type=float, metavar="C", help="Share of true disparities to be inside, .5 to .99."),
     click.option("--calibration", type=NAME, help="Calibration for --coverage; default the built-in one."),
-    click.option("--alpha", type=float, metavar="A", help="Level of possibility, above 0 to 1, instead of a coverage."),
+    expert_option("--alpha", type=float, metavar="A", help="Level of possibility, above 0 to 1; no coverage."),
 )
 _FIRST_SETTINGS = (
     click.option("--config", "config_file", type=FILE, help="Settings (YAML); the command line wins."),
@@ -171,17 +172,17 @@ _FIRST_SETTINGS = (
     ),
 )
 _LAST_SETTINGS = (
-    click.option(
+    expert_option(
         "--rows", type=click.Choice(("auto", "none")), help="Row offsets of the right image: taken out, or left."
     ),
-    click.option("--tile-size", type=int, help="Side of a tile's core in pixels, a multiple of 64."),
+    expert_option("--tile-size", type=int, help="Side of a tile's core in pixels, a multiple of 64."),
     click.option("--workers", type=click.IntRange(min=1), help="Tiles at once; default one per core."),
-    click.option(
+    expert_option(
         "--cluster",
         metavar="SPEC",
         help="threads (default), processes, slurm, pbs, lsf, sge, or the address of a dask scheduler.",
     ),
-    click.option(
+    expert_option(
         "--set", "named", multiple=True, metavar="KEY=VALUE", help="Any other setting, such as tiles.overlap=100."
     ),
 )
@@ -286,15 +287,15 @@ def search_options(command: Command) -> Command:
             metavar="MIN MAX",
             help="Search range in pixels, both ends searched; default: found from the images.",
         ),
-        click.option(
+        expert_option(
             "--local-range",
             is_flag=True,
             help="Search a separate range in each cell of the image, found from the images.",
         ),
-        click.option(
+        expert_option(
             "--around", type=NAME, help="Disparities of another matcher, a raster: search around them and audit them."
         ),
-        click.option("--margin", type=int, metavar="K", help="Pixels to search on both sides of --around; default 8."),
+        expert_option("--margin", type=int, metavar="K", help="Pixels to search on both sides of --around; default 8."),
     )
 
 
@@ -303,8 +304,8 @@ def run_options(command: Command) -> Command:
     with_run = gathered(
         "run",
         RunArguments,
-        click.option("--strict", is_flag=True, help="End with status 1 if the run prints a warning."),
-        click.option("--keep-tiles", is_flag=True, help="Keep the products of tiles, until a call without it."),
+        expert_option("--strict", is_flag=True, help="End with status 1 if the run prints a warning."),
+        expert_option("--keep-tiles", is_flag=True, help="Keep the products of tiles, until a call without it."),
         click.option(
             "--overwrite",
             is_flag=True,

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import wraps
+from functools import partial, wraps
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,27 @@ PRESETS = ("satellite", "satellite-mccnn", "paper", "mccnn")
 
 # Pictures that `plot` writes to the folder of a run, without their ending.
 PICTURES = ("overview", "errors", "coverage", "range", "rows", "profile", "curve", "dsm")
+
+
+class _Expert(click.Option):
+    """An option that few runs need."""
+
+
+expert_option = partial(click.option, cls=_Expert)
+
+
+class Grouped(click.Command):
+    """A command whose help lists `expert_option` under a heading of their own, at the end."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write both lists."""
+        options = [one for one in self.get_params(ctx) if isinstance(one, click.Option)]
+        for title, is_expert in (("Options", False), ("Expert options", True)):
+            chosen = [one for one in options if isinstance(one, _Expert) == is_expert]
+            if rows := [row for one in chosen if (row := one.get_help_record(ctx))]:
+                with formatter.section(title):
+                    formatter.write_dl(rows)
+
 
 Command = Callable[..., Any]
 Decorator = Callable[[Command], Command]
@@ -202,6 +223,6 @@ def log_options(command: Command) -> Command:
 
     return with_options(
         with_log,
-        click.option("--debug", is_flag=True, help="Show the complete log, and tracebacks of errors."),
-        click.option("--log-file", type=FILE, help="Append the complete log to FILE."),
+        expert_option("--debug", is_flag=True, help="Show the complete log, and tracebacks of errors."),
+        expert_option("--log-file", type=FILE, help="Append the complete log to FILE."),
     )

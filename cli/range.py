@@ -7,13 +7,13 @@ import click
 
 from sat_intervals.cli.logs import warn
 from sat_intervals.cli.matching import PairArguments, pair_options
-from sat_intervals.cli.options import FILE, json_option, log_options, overwrite_option, quiet_option, say_json
+from sat_intervals.cli.options import FILE, Grouped, json_option, log_options, overwrite_option, quiet_option, say_json
 
 # Bars of the histogram that are printed, each of several bins.
 _BARS = 8
 
 
-@click.command("range", short_help="Find the search range of a pair.")
+@click.command("range", cls=Grouped, short_help="Find the search range of a pair.")
 @pair_options
 @click.option("--output", type=FILE, help="Write the local ranges, for the setting disparity.grid of match.")
 @overwrite_option

@@ -10,6 +10,8 @@ from sat_intervals.cli.matching import PairArguments, image_options
 from sat_intervals.cli.options import (
     FILE,
     Command,
+    Grouped,
+    expert_option,
     gathered,
     json_option,
     log_options,
@@ -32,13 +34,13 @@ def raw_options(command: Command) -> Command:
         "raw",
         _raw,
         click.option("--dem", type=FILE, help="Raw images: DEM whose heights have disparity 0."),
-        click.option(
+        expert_option(
             "--altitude",
             type=float,
             metavar="METRES",
             help="Raw images: height above the ellipsoid that has disparity 0; default the middle of the ground's.",
         ),
-        click.option(
+        expert_option(
             "--resolution-of",
             type=click.Choice(("coarser", "left")),
             help="Raw images: whose pixel size to take if they differ by more than 10 %; default coarser.",
@@ -46,7 +48,7 @@ def raw_options(command: Command) -> Command:
     )(command)
 
 
-@click.command(short_help="Make an epipolar pair of two raw images.")
+@click.command(cls=Grouped, short_help="Make an epipolar pair of two raw images.")
 @image_options
 @click.argument("out", type=FILE)
 @click.option("--left-model", type=FILE, help="RPC model of the left image; default that in or beside it.")

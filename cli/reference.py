@@ -8,6 +8,7 @@ import click
 from sat_intervals.cli.logs import warn
 from sat_intervals.cli.options import (
     FILE,
+    Grouped,
     SensorFiles,
     json_option,
     log_options,
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 _SUSPECT_ROWS = 0.5
 
 
-@click.command(short_help="Turn reference heights into true disparities of a run.")
+@click.command(cls=Grouped, short_help="Turn reference heights into true disparities of a run.")
 @click.argument("out", type=FILE)
 @click.option("--heights", type=FILE, help="Raster of heights, in any CRS.")
 @click.option("--points", type=FILE, help="Points: CSV, Parquet, LAS, LAZ, GeoPackage.")

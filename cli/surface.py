@@ -15,11 +15,11 @@ from sat_intervals.cli.matching import (
     run_options,
     search_options,
 )
-from sat_intervals.cli.options import FILE, json_option, say_json, sensor_options
+from sat_intervals.cli.options import FILE, Grouped, json_option, say_json, sensor_options
 from sat_intervals.cli.rectify import raw_options, say_rectified
 
 
-@click.command(short_help="Match a pair and make a surface model.")
+@click.command(cls=Grouped, short_help="Match a pair and make a surface model.")
 @search_options
 @pair_options
 @click.argument("out", type=FILE)

@@ -8,6 +8,7 @@ import click
 from sat_intervals.cli.logs import warn
 from sat_intervals.cli.options import (
     FILE,
+    Grouped,
     SensorFiles,
     json_option,
     log_options,
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
 
 
-@click.command(short_help="Export the points of a run with height bounds.")
+@click.command(cls=Grouped, short_help="Export the points of a run with height bounds.")
 @click.argument("out", type=FILE)
 @click.option("--output", type=FILE, help="File to write: .tif, .laz or .las; default points.tif in OUT.")
 @overwrite_option

@@ -41,10 +41,11 @@ class Config(Section):
     rows: Literal["auto", "none"] = Field(
         "auto", description="row offsets of the right image: measured and taken out, or left"
     )
+    interval: Interval | None = Interval()
+    # From here to `regularization` a calibration belongs to the settings, see `key_of`.
     cost: AnyCost = Census()
     sgm: AnySgm | None = Sgm()
     ambiguity: Ambiguity | None = Ambiguity()
-    interval: Interval | None = Interval()
     refinement: Refinement | None = Refinement()
     cross_check: CrossCheck | None = CrossCheck()
     median: Median | None = Median()
