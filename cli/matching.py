@@ -82,11 +82,9 @@ class RunArguments:
         self, left: "Image | Path", right: "Image | Path", out: Path, config: "Config", **more: Any
     ) -> dict[str, Any]:
         """Match a pair to the folder ``out``; ``more`` are arguments of `match_pair`."""
-        from sat_intervals.run.beside import compiled_beside
         from sat_intervals.run.pair import match_pair
 
-        with compiled_beside(config):
-            return match_pair(left, right, out, config, keep_tiles=self.keep_tiles, overwrite=self.overwrite, **more)
+        return match_pair(left, right, out, config, keep_tiles=self.keep_tiles, overwrite=self.overwrite, **more)
 
     def check_strict(self, warnings: Sequence[str]) -> None:
         """Raise if the run has warned, in lines that were printed, and must not."""

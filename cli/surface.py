@@ -48,7 +48,6 @@ def surface(
     finished with these images and settings is kept, the surface is made again.
     """
     from sat_intervals.cli.console import Console
-    from sat_intervals.run.beside import compiled_beside
     from sat_intervals.workflows.surface import FILES, surface
 
     if len(sensor_files) > 1:
@@ -56,7 +55,7 @@ def surface(
     left, right = pair.open()
     settings.check_kept(out, *(out / name for name in FILES))
     config = settings.load()
-    with Console(run.quiet or as_json) as console, compiled_beside(config):
+    with Console(run.quiet or as_json) as console:
         done = surface(
             left,
             right,

@@ -32,33 +32,11 @@ if typing.TYPE_CHECKING:
     __version__: str
 
 __all__ = [
-    "Config",
-    "RunError",
-    "SatIntervalsError",
-    "SurfaceChoices",
-    "Window",
-    "__version__",
-    "calibrate",
-    "calibrate_surface",
-    "calibrate_volumes",
-    "decode_flags",
-    "evaluate_run",
-    "evaluate_surface",
-    "intervals_around",
-    "intervals_of",
-    "load_config",
-    "load_height_calibration",
-    "make_surface",
-    "match_arrays",
-    "match_pair",
-    "open",
-    "open_image",
-    "open_surface",
-    "rectify",
-    "set_geometry",
-    "surface",
-    "triangulate",
-]
+    "Config", "RunError", "SatIntervalsError", "SurfaceChoices", "Window", "__version__", "calibrate",
+    "calibrate_surface", "calibrate_volumes", "decode_flags", "evaluate_run", "evaluate_surface", "intervals_around",
+    "intervals_of", "load_config", "load_height_calibration", "make_surface", "match_arrays", "match_pair", "open",
+    "open_image", "open_surface", "rectify", "set_geometry", "surface", "triangulate",
+]  # fmt: skip
 
 logging.getLogger(__name__).addHandler(logging.NullHandler())  # the application configures logging
 
