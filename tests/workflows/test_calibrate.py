@@ -192,14 +192,6 @@ def off(folder):
     return file
 
 
-def test_calibrate__a_calibration_of_other_settings_is_refused(scene, tmp_path):
-    arguments = "match", scene / "left.tif", scene / "right.tif", tmp_path / "out", "--disparity", -10, 10
-    with_calibration = "--coverage", 0.9, "--calibration", scene / "calibration.yaml"
-    line = one_line(invoke(*arguments, *with_calibration, "--preset", "paper"))
-    assert "belongs to other settings" in line
-    assert "sat-intervals calibrate" in line
-
-
 def test_calibrate__a_run_with_local_ranges_is_matched_over_its_whole_range(scene, tmp_path):
     settings = settings_with(scene)
     settings["disparity"]["local"] = True
@@ -213,16 +205,6 @@ def test_check_scenes__needs_the_search_range_as_numbers(scene):
     scene = CalibrationScene("one", "one", left, right, truth_of(left, scene / "truth.tif"), load_config({}))
     with pytest.raises(SatIntervalsError, match="one: the search range is auto, but calibrate needs it as numbers"):
         check_scenes([scene])
-
-
-def test_calibrate__levels_out_of_order_are_refused(scene, tmp_path):
-    content = yaml.safe_load((scene / "calibration.yaml").read_text())
-    content["levels"][3]["high"] = 1e-3
-    (tmp_path / "edited.yaml").write_text(yaml.safe_dump(content))
-    arguments = "match", scene / "left.tif", scene / "right.tif", tmp_path / "out", "--disparity", -10, 10
-    line = one_line(invoke(*arguments, "--coverage", 0.9, "--calibration", tmp_path / "edited.yaml"))
-    assert "edited.yaml" in line
-    assert "high falls" in line
 
 
 def test_match__warns_of_a_coverage_that_the_calibration_does_not_reach(scene, tmp_path):
