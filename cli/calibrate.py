@@ -11,12 +11,10 @@ from sat_intervals.cli.matching import SettingsArguments, settings_options
 from sat_intervals.cli.options import (
     FILE,
     Grouped,
+    Printing,
     Surface,
-    json_option,
-    log_options,
     overwrite_option,
-    quiet_option,
-    say_json,
+    printing_options,
     surface_options,
     tolerance_option,
 )
@@ -36,7 +34,7 @@ from sat_intervals.cli.options import (
 )
 @click.option("--name", help="Name of the calibration; by default that of the file.")
 @surface_options("Calibrate this surface model against --reference, instead of pairs.", "pairs", "coverage")
-@json_option
+@printing_options
 @click.option(
     "--coverage",
     type=float,
@@ -44,8 +42,6 @@ from sat_intervals.cli.options import (
     help="With --dsm: coverage that the margins must reach, .5 to .99; default: the coverage of the runs.",
 )
 @partial(settings_options, levels=False)
-@quiet_option
-@log_options
 def calibrate(
     pairs: tuple[Path, ...],
     output: Path,
@@ -54,8 +50,7 @@ def calibrate(
     surface: Surface | None,
     coverage: float | None,
     settings: SettingsArguments,
-    as_json: bool,
-    quiet: bool,
+    printing: Printing,
     **how: Any,
 ) -> None:
     """Find the levels of the cost curve whose intervals reach coverages of .5 to .99 on PAIRS, and write them to FILE.
@@ -75,15 +70,14 @@ def calibrate(
     heights of --reference (its own coverage, or --coverage). Use FILE with: dsm --calibration FILE.
     """
     if surface is not None:
-        calibrate_heights(surface, output, name, coverage, overwrite=overwrite, as_json=as_json, quiet=quiet)
+        calibrate_heights(surface, output, name, coverage, printing, overwrite=overwrite)
         return
     if not pairs:
         raise click.UsageError("give PAIRS, or --dsm and --reference.")
-    from sat_intervals.cli.console import Console
     from sat_intervals.cli.tables import show_calibration
     from sat_intervals.workflows.calibrate import calibrate
 
-    with Console(quiet or as_json) as console:
+    with printing.console() as console:
         calibration, expected = calibrate(
             pairs,
             output,
@@ -94,8 +88,7 @@ def calibrate(
             progress=console.progress,
             **how,
         )
-    if as_json:
-        say_json({"calibration": calibration.model_dump(mode="json"), "expected": expected})
-    elif not quiet:
+    printing.say({"calibration": calibration.model_dump(mode="json"), "expected": expected})
+    if not printing.is_silent:
         show_calibration(calibration, expected)
         click.echo(str(output))

@@ -12,14 +12,13 @@ from sat_intervals.cli.options import (
     FILE,
     Command,
     Grouped,
+    Printing,
     SensorFiles,
     expert_option,
-    json_option,
-    log_options,
     note_geometry,
+    output_file,
     overwrite_option,
-    quiet_option,
-    say_json,
+    printing_options,
     sensor_options,
     with_options,
 )
@@ -65,15 +64,12 @@ _CELL_OPTIONS = (
 
 
 def cell_options(command: Command) -> Command:
-    """Add options for the cells of a surface; the command gets ``cells``, arguments of `make_surface`.
-
-    A `calibration_option` goes with it.
-    """
+    """Add options for the cells of a surface, beside a `calibration_option`: ``cells``, arguments of `make_surface`."""
 
     @wraps(command)
     def with_cells(**given: Any) -> Any:
-        of_choices = ("bounds", "keeps_open", "keeps_border", "outliers", "max_width", "min_confidence")
-        choices = {name: given.pop(name) for name in of_choices}
+        names = ("bounds", "keeps_open", "keeps_border", "outliers", "max_width", "min_confidence")
+        choices = {name: given.pop(name) for name in names}
         calibration = given.pop("height_calibration")
         cells = {name: given.pop(name) for name in ("resolution", "crs", "radius", "geoid")}
         like = given.pop("grid_like")
@@ -137,17 +133,14 @@ def say_surface(console: "Console", report: dict[str, Any]) -> None:
 @click.option("--output", type=FILE, help="File to write; default dsm.tif in the first OUT.")
 @overwrite_option
 @sensor_options
-@json_option
-@quiet_option
-@log_options
+@printing_options
 def dsm(
     outs: tuple[Path, ...],
     cells: dict[str, Any],
     output: Path | None,
     overwrite: bool,
     sensor_files: list[SensorFiles],
-    as_json: bool,
-    quiet: bool,
+    printing: Printing,
 ) -> None:
     """Make a surface model from the finished runs in the folders OUT.
 
@@ -164,17 +157,12 @@ def dsm(
     Where several OUT overlap, their intervals are averaged, narrow ones with the most weight. Where they do not meet,
     agreement is 0, and their hull and the height of the narrowest are written.
     """
-    from sat_intervals.cli.console import Console
     from sat_intervals.heights.dsm import make_surface
-    from sat_intervals.raster.publishing import check_free
 
-    if output:
-        check_free(output, overwrite=overwrite)
-    output = output or outs[0] / "dsm.tif"
-    with Console(quiet or as_json) as console:
+    output = output_file(output, outs[0] / "dsm.tif", overwrite=overwrite)
+    with printing.console() as console:
         note_geometry(outs, sensor_files)
         report = make_surface(outs, output, **cells, progress=console.progress)
-    if as_json:
-        say_json(report)
+    printing.say(report)
     say_surface(console, report)
     console.say(str(output))

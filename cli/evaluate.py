@@ -11,10 +11,11 @@ from sat_intervals.cli.matching import SettingsArguments, settings_options
 from sat_intervals.cli.options import (
     FILE,
     Grouped,
+    Printing,
     Surface,
+    gathered,
     json_option,
     log_options,
-    say_json,
     surface_options,
     tolerance_option,
 )
@@ -43,15 +44,14 @@ _BIAS = 0.25
 @settings_options
 @tolerance_option
 @json_option
-@click.option("--quiet", "-q", is_flag=True, help="Print figures and errors only.")
+@gathered("printing", Printing, click.option("--quiet", "-q", is_flag=True, help="Print figures and errors only."))
 @log_options
 def evaluate(
     folders: tuple[Path, ...],
     surface: Surface | None,
     details: Details,
     settings: SettingsArguments,
-    as_json: bool,
-    quiet: bool,
+    printing: Printing,
     **how: Any,
 ) -> None:
     """Evaluate the intervals of the runs in the folders OUT against the truth of their left images.
@@ -73,7 +73,7 @@ def evaluate(
     the surface; figures of all cells are printed before and after that.
     """
     if surface:
-        evaluate_heights(surface, details, as_json=as_json, quiet=quiet)
+        evaluate_heights(surface, details, printing)
         return
     if not folders:
         raise click.UsageError("Missing argument 'OUT...'.")
@@ -87,17 +87,17 @@ def evaluate(
         )
 
     def on_match(name: str) -> None:
-        if not quiet:
+        if not printing.quiet:
             click.echo(f"matching {name}", err=True)
 
     scenes = evaluate_scenes(folders, settings.file, settings.sections, on_match=on_match, **how)
-    if as_json:
-        say_json(scenes[0].report if len(scenes) == 1 else {scene.name: scene.report for scene in scenes})
+    if printing.as_json:
+        printing.say(scenes[0].report if len(scenes) == 1 else {scene.name: scene.report for scene in scenes})
     elif len(scenes) == 1:
         show_scene(scenes[0])
     else:
         show_scenes(scenes)
-    if not quiet:
+    if not printing.quiet:
         warn(_doubts(scenes, how["tolerance"]))
 
 

@@ -1,7 +1,7 @@
 """Options shared by the commands that match: the pair, its settings, the run."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,8 +13,10 @@ from sat_intervals.cli.options import (
     NAME,
     PRESETS,
     Command,
+    Printing,
     expert_option,
     gathered,
+    json_option,
     log_options,
     quiet_option,
     with_options,
@@ -30,20 +32,28 @@ if TYPE_CHECKING:
 class PairArguments:
     """Two epipolar images with their masks, no-data values and bands, and the region of the left one to match."""
 
-    images: tuple[str, str]
-    masks: tuple[str | None, str | None]
-    nodata: tuple[float | None, float | None]
-    bands: tuple[int | None, int | None]
-    window: "Window | None"
+    left: str
+    right: str
+    left_mask: str | None
+    right_mask: str | None
+    nodata: tuple[float, float] | None
+    band: tuple[int, int] | None
+    region: tuple[int, int, int, int] | None = None
+
+    @property
+    def window(self) -> "Window | None":
+        """Return the region to match, None for all."""
+        from sat_intervals.tiling import Window
+
+        return Window(*self.region) if self.region else None
 
     def open(self) -> "tuple[Image, Image]":
         """Open both images."""
         from sat_intervals.raster import open_image
 
-        left, right = (
-            open_image(file, band=band, nodata=nodata, mask=mask)
-            for file, mask, nodata, band in zip(self.images, self.masks, self.nodata, self.bands, strict=True)
-        )
+        nodata, band = self.nodata or (None, None), self.band or (None, None)
+        left = open_image(self.left, band=band[0], nodata=nodata[0], mask=self.left_mask)
+        right = open_image(self.right, band=band[1], nodata=nodata[1], mask=self.right_mask)
         return left, right
 
 
@@ -70,13 +80,12 @@ class SettingsArguments:
 
 
 @dataclass(frozen=True)
-class RunArguments:
+class RunArguments(Printing):  # type: ignore[misc,unused-ignore]
     """How a run treats the tiles and files of its folder, and what it prints."""
 
     keep_tiles: bool
     overwrite: bool
     strict: bool
-    quiet: bool
 
     def match(
         self, left: "Image | Path", right: "Image | Path", out: Path, config: "Config", **more: Any
@@ -110,29 +119,10 @@ class _Both(click.ParamType):  # type: ignore[type-arg,unused-ignore]
         return left, right_or_left
 
 
-def _images(
-    *,
-    left: str,
-    right: str,
-    left_mask: str | None,
-    right_mask: str | None,
-    nodata: tuple[float, float] | None,
-    band: tuple[int, int] | None,
-) -> PairArguments:
-    nothing = (None, None)
-    return PairArguments((left, right), (left_mask, right_mask), nodata or nothing, band or nothing, None)
-
-
-def _with_window(*, pair: PairArguments, window: tuple[int, int, int, int] | None) -> PairArguments:
-    from sat_intervals.tiling import Window
-
-    return replace(pair, window=Window(*window) if window else None)
-
-
 # The command gets ``pair``.
 image_options = gathered(
     "pair",
-    _images,
+    PairArguments,
     click.argument("left", type=NAME),
     click.argument("right", type=NAME),
     click.option("--left-mask", type=NAME, help="Mask of the left image: non-zero = masked."),
@@ -149,10 +139,9 @@ image_options = gathered(
 
 def pair_options(command: Command) -> Command:
     """Add options for an epipolar pair and the region to match; the command gets ``pair``, a `PairArguments`."""
-    window = click.option(
-        "--window", type=int, nargs=4, metavar="ROW COL HEIGHT WIDTH", help="Region of the left image to match."
-    )
-    return image_options(gathered("pair", _with_window, window)(command))
+    names = "--window", "region"
+    text = "Region of the left image to match."
+    return image_options(click.option(*names, type=int, nargs=4, metavar="ROW COL HEIGHT WIDTH", help=text)(command))
 
 
 _LEVEL_OPTIONS = (
@@ -197,10 +186,7 @@ _PLACES = {
 
 
 def settings_options(command: Command, *, levels: bool = True) -> Command:
-    """Add options for settings; the command gets ``settings``, a `SettingsArguments`.
-
-    ``levels``: whether --coverage, --calibration and --alpha are among them.
-    """
+    """Add options for settings; ``levels``: also --coverage, --calibration and --alpha."""
 
     @wraps(command)
     def with_settings(
@@ -309,6 +295,7 @@ def run_options(command: Command) -> Command:
             is_flag=True,
             help="May replace another run in OUT; its tiles are deleted, equal ones are used again.",
         ),
+        json_option,
         quiet_option,
     )
     return with_run(log_options(command))

@@ -11,13 +11,11 @@ from sat_intervals.cli.options import (
     FILE,
     Command,
     Grouped,
+    Printing,
     expert_option,
     gathered,
-    json_option,
-    log_options,
     overwrite_option,
-    quiet_option,
-    say_json,
+    printing_options,
 )
 
 if TYPE_CHECKING:
@@ -56,20 +54,8 @@ def raw_options(command: Command) -> Command:
 @raw_options
 @click.option("--geoid", type=FILE, help="Geoid grid that heights of --dem refer to; default the ellipsoid.")
 @overwrite_option
-@json_option
-@quiet_option
-@log_options
-def rectify(
-    pair: PairArguments,
-    out: Path,
-    left_model: Path | None,
-    right_model: Path | None,
-    raw: dict[str, Any],
-    geoid: Path | None,
-    overwrite: bool,
-    as_json: bool,
-    quiet: bool,
-) -> None:
+@printing_options
+def rectify(pair: PairArguments, out: Path, raw: dict[str, Any], printing: Printing, **more: Any) -> None:
     """Resample the raw images LEFT and RIGHT, with RPC models, to an epipolar pair in the folder OUT.
 
     \b
@@ -83,16 +69,13 @@ def rectify(
     `surface` does all of it. Models: RPC in tags of GeoTIFF or NITF, .RPB, _RPC.TXT, DIMAP XML, .geom.
     Needs shareloc: pip install 'sat-intervals[dsm]'.
     """  # noqa: D301 (click's mark of a preformatted paragraph)
-    from sat_intervals.cli.console import Console
     from sat_intervals.workflows.rectify import rectify
 
     left, right = pair.open()
-    raw |= {"left_model": left_model, "right_model": right_model, "geoid": geoid}
-    with Console(quiet or as_json) as console:
-        record = rectify(left, right, out, **raw, overwrite=overwrite, progress=console.progress)
+    with printing.console() as console:
+        record = rectify(left, right, out, **raw, **more, progress=console.progress)
         say_rectified(console, record)
-    if as_json:
-        say_json(record)
+    printing.say(record)
     for name in ("left.tif", "right.tif", "left_grid.tif", "right_grid.tif", "rectify.json"):
         console.say(str(out / name))
 

@@ -204,9 +204,11 @@ def job_of(
     prepared = replace(prepared, config=config)
     read = [*identities(inputs), *(files_of(config.disparity.grid) if config.disparity.grid else ())]
     manifest = _manifest(prepared, relative_in(out, inputs), region)
-    run, store, home = digest(manifest), config.cluster.store, folder_at(home_of(out))
-    folder = folder_at(f"{folder_at(store)}/{'-'.join(filter(None, (pair, run)))}" if store else home_of(out))
-    manifest[PLACE] = None if folder == home else str(folder)
+    run = digest(manifest)
+    folder = folder_at(home_of(out))
+    if config.cluster.store:
+        folder = folder_at(f"{folder_at(config.cluster.store)}/{'-'.join(filter(None, (pair, run)))}")
+    manifest[PLACE] = None if folder == folder_at(home_of(out)) else str(folder)
     check_not_replaced(read, [out / name for name in OUTPUTS], [home_of(out)])
     kept = Store(folder, Grid(region, config.tiles.size), run)
     return Job(prepared, kept, out, manifest, requested, overwrite)

@@ -82,7 +82,8 @@ def match_pair(
     RunError
         Tiles failed; no output was published.
     """
-    config, out, seconds = _named(load_config(config), volume_of), Path(out), dict[str, float]()
+    config, out = _named(load_config(config), volume_of), Path(out)
+    seconds: dict[str, float] = {}
     with Connection(config.cluster, out) as connection:
         with logged_stage(seconds, "start"):
             each = EachOnWorkers(connection, progress)

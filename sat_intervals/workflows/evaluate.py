@@ -36,23 +36,26 @@ def evaluate_scenes(
     """
     sources = find_sources(paths, truths, masks)
     configs = {source.name: _config(source.pair, config, overrides) for source in sources if source.pair}
-    if any(settings.interval is None for settings in configs.values()):
-        place = f"{config}: " if config else ""
-        raise SatIntervalsError(f"{place}interval is null, but evaluate needs intervals: leave it on")
     scenes = []
     for source in sources:
         if source.pair:
             on_match(source.name)
             report = _matched(source, source.pair, configs[source.name], **how)
+            of = source.pair.group
         else:
             report = evaluate_run(source.name, source.truth, source.mask, **how)
-        scenes.append(SceneMetrics(source.name, group or _group(source), report))
+            of = group or group_beside(open_run(source.name).report["inputs"]["left"]["path"])
+        scenes.append(SceneMetrics(source.name, group or of, report))
     return scenes
 
 
 def _config(pair: Pair, config: Path | None, overrides: Mapping[str, Any] | None) -> Config:
     sections = {"disparity": {"minimum": pair.minimum, "maximum": pair.maximum}, "products": {"keep_rejected": True}}
-    return load_config(load_config(config, overrides), sections)
+    settings = load_config(load_config(config, overrides), sections)
+    if settings.interval is None:
+        place = f"{config}: " if config else ""
+        raise SatIntervalsError(f"{place}interval is null, but evaluate needs intervals: leave it on")
+    return settings
 
 
 def _matched(source: Source, pair: Pair, config: Config, **how: Any) -> dict[str, Any]:
@@ -61,9 +64,3 @@ def _matched(source: Source, pair: Pair, config: Config, **how: Any) -> dict[str
         for line in match_pair(pair.left, pair.right, out, config)["warnings"]:
             _LOG.warning("%s", line)
         return evaluate_run(out, source.truth, source.mask, **how)
-
-
-def _group(source: Source) -> str:
-    if source.pair is None:
-        return group_beside(open_run(source.name).report["inputs"]["left"]["path"])
-    return source.pair.group
