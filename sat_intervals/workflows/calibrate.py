@@ -79,10 +79,9 @@ def calibrate(
     RunError
         Tiles failed.
     """
-    given, output = [Path(one) for one in (*pairs, *truths)], Path(output)
-    choices = Choices(config, overrides, tolerance, remove_bias, by_group)
-    scenes = scenes_of(given[: len(pairs)], given[len(pairs) :], choices)
-    _check_kept(scenes, given, config, output)
+    output, paths, files = Path(output), [Path(one) for one in pairs], [Path(one) for one in truths]
+    scenes = scenes_of(paths, files, Choices(config, overrides, tolerance, remove_bias, by_group))
+    _check_kept(scenes, [*paths, *files], config, output)
     check_output(output, overwrite=overwrite)
     check_scenes(scenes)
     parts = measure_scenes(scenes, output.absolute().parent, progress)
@@ -109,12 +108,12 @@ class Choices:
 def scenes_of(paths: Sequence[Path], truths: Sequence[Path], choices: Choices) -> list[CalibrationScene]:
     """Open pairs and runs, in their order."""
     return [
-        _of_pair(source.pair, source.truth, choices) if source.pair else _of_run(source, choices)
+        _of_pair(source.pair, source.truth or source.pair.truth, choices) if source.pair else _of_run(source, choices)
         for source in find_sources(paths, truths)
     ]
 
 
-def _of_pair(pair: Pair, truth: Path | None, choices: Choices) -> CalibrationScene:
+def _of_pair(pair: Pair, truth: Path, choices: Choices) -> CalibrationScene:
     config = choices.load({"minimum": pair.minimum, "maximum": pair.maximum})
     left = open_image(pair.left)
     return CalibrationScene(
@@ -122,7 +121,7 @@ def _of_pair(pair: Pair, truth: Path | None, choices: Choices) -> CalibrationSce
         pair.group if choices.by_group else pair.name,
         left,
         open_image(pair.right),
-        truth_of(left, truth or pair.truth),
+        truth_of(left, truth),
         config,
         tolerance=choices.tolerance if pair.tolerance is None else pair.tolerance,
         remove_bias=choices.remove_bias if pair.remove_bias is None else pair.remove_bias,
