@@ -41,7 +41,7 @@ RESUMED = ("match", "demo", "batch", "surface", "rectify")
 STEPS: dict[str, tuple[click.Command, ...]] = {
     "Try and prepare": (demo, search_range, plan, config),
     "Match": (match, batch, status),
-    "BlockMatch": (plot, report, project),
+    "Inspect": (plot, report, project),
     "Heights": (surface, rectify, dsm, triangulate),
     "Compare with a truth": (reference, evaluate, calibrate),
     "Use elsewhere": (export, stac),

@@ -7,17 +7,16 @@ import click
 
 from sat_intervals.cli.logs import warn
 from sat_intervals.cli.matching import RunArguments, SettingsArguments, run_options, settings_options
-from sat_intervals.cli.options import FILE, json_option, say_json
+from sat_intervals.cli.options import FILE, Grouped
 from sat_intervals.cli.rectify import say_rectified
 
 
-@click.command(short_help="Match many pairs; a rerun matches the missing ones.")
+@click.command(cls=Grouped, short_help="Match many pairs; a rerun matches the missing ones.")
 @click.argument("pairs", type=FILE)
 @click.argument("out", type=FILE)
-@json_option
 @settings_options
 @run_options
-def batch(pairs: Path, out: Path, as_json: bool, settings: SettingsArguments, run: RunArguments) -> None:
+def batch(pairs: Path, out: Path, settings: SettingsArguments, run: RunArguments) -> None:
     """Match the PAIRS of a CSV, YAML or JSON file, each into its own folder in OUT.
 
     Columns: name, left, right, minimum, maximum, left_mask, right_mask, nodata, band, window, and any setting such as
@@ -25,7 +24,6 @@ def batch(pairs: Path, out: Path, as_json: bool, settings: SettingsArguments, ru
     an epipolar pair with left_model, right_model, left_grid, right_grid. A failed pair does not stop the others.
     OUT/batch.json has the state of each pair; the exit status is 1 if any failed.
     """
-    from sat_intervals.cli.console import Console
     from sat_intervals.config.pairs import REPORT, read_batch
     from sat_intervals.heights.geometry import geometry_warnings
     from sat_intervals.raster.identity import check_not_replaced
@@ -33,7 +31,7 @@ def batch(pairs: Path, out: Path, as_json: bool, settings: SettingsArguments, ru
 
     check_not_replaced([pairs, settings.file], [out / REPORT])
     doubts: list[str] = []
-    with Console(run.quiet or as_json) as console:
+    with run.console() as console:
 
         def on_rectified(record: dict[str, Any]) -> None:
             say_rectified(console, record)
@@ -49,8 +47,7 @@ def batch(pairs: Path, out: Path, as_json: bool, settings: SettingsArguments, ru
             progress=console.progress,
             on_rectified=on_rectified,
         )
-    if as_json:
-        say_json(report)
+    run.say(report)
     console.batch_summary(report)
     of_surfaces = [
         line for end in report.values() if "surface" in end for line in geometry_warnings(end["surface"]["geometry"])

@@ -5,9 +5,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from sat_intervals.cli.calibration_files import check_output, write
 from sat_intervals.cli.logs import warn
-from sat_intervals.cli.options import Surface, say_json
+from sat_intervals.cli.options import Printing, Surface
 
 if TYPE_CHECKING:
     from sat_intervals.config import HeightCalibration
@@ -20,27 +19,20 @@ _HEIGHTS = """\
 
 
 def calibrate_heights(
-    surface: Surface,
-    output: Path,
-    name: str | None,
-    coverage: float | None,
-    *,
-    overwrite: bool,
-    as_json: bool,
-    quiet: bool,
+    surface: Surface, output: Path, name: str | None, coverage: float | None, printing: Printing, *, overwrite: bool
 ) -> None:
     """Calibrate the intervals of a surface model, and write and print their margins."""
     from sat_intervals.evaluate.surface_calibration import calibrate_surface
-    from sat_intervals.raster.identity import check_not_replaced
+    from sat_intervals.raster import check_not_replaced
+    from sat_intervals.workflows.calibrate import check_output, write_commented
 
     files = surface.dsm, surface.reference
     check_not_replaced(files, [output])
     check_output(output, overwrite=overwrite)
     calibration = calibrate_surface(*files, name or output.stem, coverage=coverage, registers=surface.registers)
-    write(output, _HEIGHTS, calibration.model_dump(mode="json"))
-    if as_json:
-        say_json(calibration.model_dump(mode="json"))
-    elif not quiet:
+    write_commented(output, _HEIGHTS, calibration.model_dump(mode="json"))
+    printing.say(calibration.model_dump(mode="json"))
+    if not printing.is_silent:
         _show(calibration)
         click.echo(str(output))
 
@@ -54,24 +46,17 @@ def _show(calibration: "HeightCalibration") -> None:
         ends = f"from {start:g}" if kind.below is None else f"{start:g} to {kind.below:g}"
         rows.append([f"width {ends} m", str(kind.cells), f"{kind.margin:+.2f}"])
         start = kind.below or 0.0
-    show(
-        ["", "cells", "margin (m)"],
-        rows,
-        f"both bounds move outwards by the margin, for coverage {calibration.coverage:g}",
-    )
+    title = f"both bounds move outwards by the margin, for coverage {calibration.coverage:g}"
+    show(["", "cells", "margin (m)"], rows, title)
     found = calibration.provenance
     if found["shift"] is not None:
         east, north, up = found["shift"]
         click.echo(f"reference moved: easting {east:+.2f} m, northing {north:+.2f} m, height {up:+.2f} m")
-    keys = {
-        "coverage": "coverage",
-        "lowest": "lowest",
-        "median_width": "median width (m)",
-        "mean_width": "mean width (m)",
-    }
+    keys = "coverage", "lowest", "median_width", "mean_width"
     figures = {"before": found["before"], "calibrated on the other blocks": found["expected"] or {}}
     rows = [
         [name, *("-" if one.get(key) is None else f"{one[key]:.3f}" for key in keys)] for name, one in figures.items()
     ]
-    show(["", *keys.values()], rows, "coverage and widths: before, and expected on ground that was held out")
+    header = ["", "coverage", "lowest", "median width (m)", "mean width (m)"]
+    show(header, rows, "coverage and widths: before, and expected on ground that was held out")
     warn(found["warnings"])

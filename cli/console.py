@@ -52,7 +52,6 @@ class Console:
     """Shows progress: a bar on a terminal, plain lines elsewhere, nothing with ``--quiet``."""
 
     def __init__(self, quiet: bool) -> None:
-        self.quiet = quiet
         # Paths may have square brackets and colons, which are not markup.
         self._terminal = Terminal(quiet=quiet, highlight=False, markup=False, emoji=False)
         self._bar = Progress(
@@ -81,11 +80,11 @@ class Console:
         began, before = self._began.setdefault(stage, (time.monotonic(), done))
         elapsed = time.monotonic() - began
         rate = (done - before) / elapsed if elapsed > 0 else 0.0
-        state = _state(done, total, rate) if total > 1 else ""
-        if self._bar.disable:
-            self._print_line(stage, total)
-        else:
-            self._draw(stage, done, total, state)
+        if not self._bar.disable:
+            self._draw(stage, done, total, _state(done, total, rate) if total > 1 else "")
+        elif stage not in self._printed:
+            self._printed.add(stage)
+            self.say(f"{STAGES[stage]}: {total}" if total > 1 else STAGES[stage])
 
     def _draw(self, stage: str, done: int, total: int, state: str) -> None:
         """Draw the bar of a stage in place of the previous one."""
@@ -94,12 +93,6 @@ class Console:
                 self._bar.remove_task(self._task[1])
             self._task = stage, self._bar.add_task(STAGES[stage], state="")
         self._bar.update(self._task[1], completed=done, total=total if total > 1 else None, state=state)
-
-    def _print_line(self, stage: str, total: int) -> None:
-        """Print a line at the start of a stage."""
-        if stage not in self._printed:
-            self._printed.add(stage)
-            self._terminal.print(f"{STAGES[stage]}: {total}" if total > 1 else STAGES[stage], soft_wrap=True)
 
     def say(self, text: str) -> None:
         """Print a line."""
@@ -134,7 +127,7 @@ class Console:
         self.say(report["verdict"])
         warn(report["warnings"])
         for name in ("intervals.tif", "validity.tif", "run.json"):
-            self._terminal.print(str(out / name), soft_wrap=True)
+            self.say(str(out / name))
         if old := [name for name in _MADE_FROM_RUNS if _is_older(out / name, out / "run.json")]:
             self.say(f"of an earlier run: {', '.join(old)}: make them again")
         if then:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from sat_intervals.cli.matching import RunArguments, SettingsArguments, run_options, settings_options
-from sat_intervals.cli.options import FILE, json_option, say_json
+from sat_intervals.cli.options import FILE, Grouped
 
 if TYPE_CHECKING:
     import numpy as np
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from sat_intervals.raster import Georeferencing
 
 
-@click.command(short_help="Make a scene with exact truth, match it and compare.")
+@click.command(cls=Grouped, short_help="Make a scene with exact truth, match it and compare.")
 @click.argument("out", type=FILE)
 @click.option(
     "--size", type=int, nargs=2, metavar="ROWS COLUMNS", default=(1200, 1200), show_default=True, help="Size in pixels."
@@ -29,17 +29,10 @@ if TYPE_CHECKING:
     show_default=True,
     help="Height of a mountain under the city; 1 m is a disparity of 1 px.",
 )
-@json_option
 @settings_options
 @run_options
 def demo(
-    out: Path,
-    size: tuple[int, int],
-    seed: int,
-    relief: float,
-    as_json: bool,
-    settings: SettingsArguments,
-    run: RunArguments,
+    out: Path, size: tuple[int, int], seed: int, relief: float, settings: SettingsArguments, run: RunArguments
 ) -> None:
     """Make a procedural satellite scene, match it and print how often the interval contains the truth.
 
@@ -48,14 +41,13 @@ def demo(
     OUT/truth.tif                 the exact disparity
     and the files of `match`.
     """  # noqa: D301 (\b keeps the line breaks in click)
-    from sat_intervals.cli.console import Console
     from sat_intervals.demo import PIXEL, make_scene
     from sat_intervals.evaluate.disparity import evaluate_run
     from sat_intervals.raster import north_up
 
     layers = [out / f"{name}.tif" for name in ("left", "right", "truth")]
     somewhere, nodata = north_up(32631, x=370_000, y=4_830_000, pixel=PIXEL), (0, 0, float("nan"))
-    with Console(run.quiet or as_json) as console:
+    with run.console() as console:
         console.progress("scene", 0, 1)
         scene = make_scene(*size, seed=seed, relief=relief)
         config = settings.load(disparity={"minimum": scene.minimum, "maximum": scene.maximum})
@@ -65,9 +57,8 @@ def demo(
         console.progress("scene", 1, 1)
         report = run.match(out / "left.tif", out / "right.tif", out, config, progress=console.progress)
     figures = evaluate_run(out, out / "truth.tif")["all"]
-    if as_json:
-        say_json({"run": report, "truth": figures})
-    else:
+    run.say({"run": report, "truth": figures})
+    if not run.as_json:
         console.summary(report, out)
         if figures["count"]:
             console.say(

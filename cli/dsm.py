@@ -11,13 +11,14 @@ from sat_intervals.cli.logs import warn
 from sat_intervals.cli.options import (
     FILE,
     Command,
+    Grouped,
+    Printing,
     SensorFiles,
-    json_option,
-    log_options,
+    expert_option,
     note_geometry,
+    output_file,
     overwrite_option,
-    quiet_option,
-    say_json,
+    printing_options,
     sensor_options,
     with_options,
 )
@@ -30,48 +31,45 @@ _CELL_OPTIONS = (
     click.option("--resolution", type=float, metavar="METRES", help="Side of a cell; or give --grid-like."),
     click.option("--grid-like", type=FILE, help="North-up raster whose grid and CRS the surface takes."),
     click.option("--crs", metavar="EPSG", help="A projected CRS in metres; default the UTM zone of the points."),
-    click.option("--radius", type=float, metavar="METRES", help="Reach of a point; default the side of a cell."),
+    expert_option("--radius", type=float, metavar="METRES", help="Reach of a point; default the side of a cell."),
     click.option("--geoid", type=FILE, help="Geoid grid (GTX, GeoTIFF) that heights refer to."),
-    click.option(
+    expert_option(
         "--bounds",
         type=click.Choice(("envelope", "median")),
         help="Interval of a cell: medians of its points' bounds (default for runs with a coverage), or the envelope of "
         "their intervals (default for others).",
     ),
-    click.option(
+    expert_option(
         "--keep-border",
         "keeps_border",
         is_flag=True,
         help="Keep points of confidence below 0.1 beside missing data of the right image.",
     ),
-    click.option(
+    expert_option(
         "--keep-open/--drop-open",
         "keeps_open",
         default=None,
         help="Keep or leave out points whose interval is open at an end of the search range; default: leave out with a "
         "coverage, else keep.",
     ),
-    click.option(
+    expert_option(
         "--outliers",
         type=float,
         metavar="METRES",
         help="Leave out points farther than this from the median height within 2 pixels; default: none.",
     ),
-    click.option("--max-width", type=float, metavar="METRES", help="Leave out cells with a wider interval."),
-    click.option("--min-confidence", type=float, metavar="C", help="Leave out cells of lower confidence, 0 to 1."),
+    expert_option("--max-width", type=float, metavar="METRES", help="Leave out cells with a wider interval."),
+    expert_option("--min-confidence", type=float, metavar="C", help="Leave out cells of lower confidence, 0 to 1."),
 )
 
 
 def cell_options(command: Command) -> Command:
-    """Add options for the cells of a surface; the command gets ``cells``, arguments of `make_surface`.
-
-    A `calibration_option` goes with it.
-    """
+    """Add options for the cells of a surface, beside a `calibration_option`: ``cells``, arguments of `make_surface`."""
 
     @wraps(command)
     def with_cells(**given: Any) -> Any:
-        of_choices = ("bounds", "keeps_open", "keeps_border", "outliers", "max_width", "min_confidence")
-        choices = {name: given.pop(name) for name in of_choices}
+        names = ("bounds", "keeps_open", "keeps_border", "outliers", "max_width", "min_confidence")
+        choices = {name: given.pop(name) for name in names}
         calibration = given.pop("height_calibration")
         cells = {name: given.pop(name) for name in ("resolution", "crs", "radius", "geoid")}
         like = given.pop("grid_like")
@@ -128,24 +126,21 @@ def say_surface(console: "Console", report: dict[str, Any]) -> None:
     )
 
 
-@click.command(short_help="Make a surface model with height intervals from one or several runs.")
+@click.command(cls=Grouped, short_help="Make a surface model with height intervals from one or several runs.")
 @click.argument("outs", metavar="OUT...", nargs=-1, required=True, type=FILE)
 @cell_options
 @calibration_option("--calibration")
 @click.option("--output", type=FILE, help="File to write; default dsm.tif in the first OUT.")
 @overwrite_option
 @sensor_options
-@json_option
-@quiet_option
-@log_options
+@printing_options
 def dsm(
     outs: tuple[Path, ...],
     cells: dict[str, Any],
     output: Path | None,
     overwrite: bool,
     sensor_files: list[SensorFiles],
-    as_json: bool,
-    quiet: bool,
+    printing: Printing,
 ) -> None:
     """Make a surface model from the finished runs in the folders OUT.
 
@@ -162,17 +157,12 @@ def dsm(
     Where several OUT overlap, their intervals are averaged, narrow ones with the most weight. Where they do not meet,
     agreement is 0, and their hull and the height of the narrowest are written.
     """
-    from sat_intervals.cli.console import Console
     from sat_intervals.heights.dsm import make_surface
-    from sat_intervals.raster.publishing import check_free
 
-    if output:
-        check_free(output, overwrite=overwrite)
-    output = output or outs[0] / "dsm.tif"
-    with Console(quiet or as_json) as console:
+    output = output_file(output, outs[0] / "dsm.tif", overwrite=overwrite)
+    with printing.console() as console:
         note_geometry(outs, sensor_files)
         report = make_surface(outs, output, **cells, progress=console.progress)
-    if as_json:
-        say_json(report)
+    printing.say(report)
     say_surface(console, report)
     console.say(str(output))

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from sat_intervals.cli.options import FILE, Surface, gathered, overwrite_option, say_json
+from sat_intervals.cli.options import FILE, Printing, Surface, gathered, overwrite_option
 
 # Files of --pictures: figures and pictures.
 _FILES = "dsm-accuracy.json", "dsm-accuracy.md", "dsm-reliability.png", "dsm-errors.png", "dsm-profile.png"
@@ -73,7 +73,7 @@ details_options = gathered(
 )
 
 
-def evaluate_heights(surface: Surface, details: Details, *, as_json: bool, quiet: bool) -> None:
+def evaluate_heights(surface: Surface, details: Details, printing: Printing) -> None:
     """Print figures, and write them with pictures to the folder, whose names are not printed if quiet."""
     from sat_intervals.cli.tables import show_surface
     from sat_intervals.evaluate.surface_accuracy import evaluate_surface
@@ -81,10 +81,9 @@ def evaluate_heights(surface: Surface, details: Details, *, as_json: bool, quiet
     if details.pictures:
         details.check_folder(details.pictures, surface)
     report = evaluate_surface(surface.dsm, surface.reference, details.classes, registers=surface.registers)
-    if as_json:
-        say_json(report)
-    else:
+    printing.say(report)
+    if not printing.as_json:
         show_surface(str(surface.dsm), report)
     for path in details.draw(details.pictures, surface, report) if details.pictures else ():
-        if not quiet:
-            click.echo(path, err=as_json)
+        if not printing.quiet:
+            click.echo(path, err=printing.as_json)

@@ -33,10 +33,7 @@ class _Warnings(logging.Formatter):
 
 
 class _Handler(logging.Handler):
-    """Writes lines to a file or to the current stderr, which a progress bar may replace.
-
-    It is not a StreamHandler, since dask silences these on its own loggers.
-    """
+    """Writes lines to a file or the current stderr; not a StreamHandler, since dask silences these on its loggers."""
 
     def __init__(self, lines: logging.Formatter, file: IO[str] | None = None) -> None:
         super().__init__()

@@ -12,19 +12,16 @@ from sat_intervals.cli.matching import (
     run_options,
     search_options,
 )
-from sat_intervals.cli.options import FILE, json_option, say_json
+from sat_intervals.cli.options import FILE, Grouped, expert_option
 
 
-@click.command(short_help="Match a pair: disparity, interval, confidence, validity.")
+@click.command(cls=Grouped, short_help="Match a pair: disparity, interval, confidence, validity.")
 @search_options
 @pair_options
 @click.argument("out", type=FILE)
-@click.option("--dry-run", is_flag=True, help="Print the job script of the cluster; submit nothing.")
-@json_option
+@expert_option("--dry-run", is_flag=True, help="Print the job script of the cluster; submit nothing.")
 @run_options
-def match(
-    pair: PairArguments, out: Path, settings: SettingsArguments, dry_run: bool, as_json: bool, run: RunArguments
-) -> None:
+def match(pair: PairArguments, out: Path, settings: SettingsArguments, dry_run: bool, run: RunArguments) -> None:
     """Match the epipolar images LEFT and RIGHT and write to the folder OUT.
 
     \b
@@ -35,7 +32,6 @@ def match(
     The disparity is x_right - x_left; its search range is found unless it is given. To resume an interrupted run,
     rerun the same command.
     """  # noqa: D301 (click's mark of a preformatted paragraph)
-    from sat_intervals.cli.console import Console
     from sat_intervals.cli.logs import warn
 
     config = settings.load()
@@ -44,13 +40,12 @@ def match(
 
         click.echo(job_script(config.cluster, out))
         return
-    with Console(run.quiet or as_json) as console:
+    with run.console() as console:
         settings.check_kept(out)
         left, right = pair.open()
         report = run.match(left, right, out, config, window=pair.window, progress=console.progress)
-    if as_json:
-        say_json(report)
+    run.say(report)
     console.summary(report, out, then="report")
-    if out.resolve() in (Path(image).parent.resolve() for image in pair.images):
+    if out.resolve() in (Path(image).parent.resolve() for image in (pair.left, pair.right)):
         warn([f"{out} also holds the images: write to another folder"])
     run.check_strict(report["warnings"])

@@ -1,7 +1,7 @@
 """Options shared by the commands that match: the pair, its settings, the run."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,10 @@ from sat_intervals.cli.options import (
     NAME,
     PRESETS,
     Command,
+    Printing,
+    expert_option,
     gathered,
+    json_option,
     log_options,
     quiet_option,
     with_options,
@@ -29,25 +32,28 @@ if TYPE_CHECKING:
 class PairArguments:
     """Two epipolar images with their masks, no-data values and bands, and the region of the left one to match."""
 
-    images: tuple[str, str]
-    masks: tuple[str | None, str | None]
-    nodata: tuple[float | None, float | None]
-    bands: tuple[int | None, int | None]
-    window: "Window | None"
+    left: str
+    right: str
+    left_mask: str | None
+    right_mask: str | None
+    nodata: tuple[float, float] | None
+    band: tuple[int, int] | None
+    region: tuple[int, int, int, int] | None = None
 
     @property
-    def files(self) -> list[str]:
-        """Return images and masks."""
-        return [*self.images, *filter(None, self.masks)]
+    def window(self) -> "Window | None":
+        """Return the region to match, None for all."""
+        from sat_intervals.tiling import Window
+
+        return Window(*self.region) if self.region else None
 
     def open(self) -> "tuple[Image, Image]":
         """Open both images."""
         from sat_intervals.raster import open_image
 
-        left, right = (
-            open_image(file, band=band, nodata=nodata, mask=mask)
-            for file, mask, nodata, band in zip(self.images, self.masks, self.nodata, self.bands, strict=True)
-        )
+        nodata, band = self.nodata or (None, None), self.band or (None, None)
+        left = open_image(self.left, band=band[0], nodata=nodata[0], mask=self.left_mask)
+        right = open_image(self.right, band=band[1], nodata=nodata[1], mask=self.right_mask)
         return left, right
 
 
@@ -74,23 +80,20 @@ class SettingsArguments:
 
 
 @dataclass(frozen=True)
-class RunArguments:
+class RunArguments(Printing):  # type: ignore[misc,unused-ignore]
     """How a run treats the tiles and files of its folder, and what it prints."""
 
     keep_tiles: bool
     overwrite: bool
     strict: bool
-    quiet: bool
 
     def match(
         self, left: "Image | Path", right: "Image | Path", out: Path, config: "Config", **more: Any
     ) -> dict[str, Any]:
         """Match a pair to the folder ``out``; ``more`` are arguments of `match_pair`."""
-        from sat_intervals.run.beside import compiled_beside
         from sat_intervals.run.pair import match_pair
 
-        with compiled_beside(config):
-            return match_pair(left, right, out, config, keep_tiles=self.keep_tiles, overwrite=self.overwrite, **more)
+        return match_pair(left, right, out, config, keep_tiles=self.keep_tiles, overwrite=self.overwrite, **more)
 
     def check_strict(self, warnings: Sequence[str]) -> None:
         """Raise if the run has warned, in lines that were printed, and must not."""
@@ -116,29 +119,10 @@ class _Both(click.ParamType):  # type: ignore[type-arg,unused-ignore]
         return left, right_or_left
 
 
-def _images(
-    *,
-    left: str,
-    right: str,
-    left_mask: str | None,
-    right_mask: str | None,
-    nodata: tuple[float, float] | None,
-    band: tuple[int, int] | None,
-) -> PairArguments:
-    nothing = (None, None)
-    return PairArguments((left, right), (left_mask, right_mask), nodata or nothing, band or nothing, None)
-
-
-def _with_window(*, pair: PairArguments, window: tuple[int, int, int, int] | None) -> PairArguments:
-    from sat_intervals.tiling import Window
-
-    return replace(pair, window=Window(*window) if window else None)
-
-
 # The command gets ``pair``.
 image_options = gathered(
     "pair",
-    _images,
+    PairArguments,
     click.argument("left", type=NAME),
     click.argument("right", type=NAME),
     click.option("--left-mask", type=NAME, help="Mask of the left image: non-zero = masked."),
@@ -149,22 +133,21 @@ image_options = gathered(
         metavar="V",
         help="No-data value of both images, or LEFT,RIGHT; replaces that of the files.",
     ),
-    click.option("--band", type=_Both(int), metavar="N", help="Band to match in both images, or LEFT,RIGHT."),
+    expert_option("--band", type=_Both(int), metavar="N", help="Band to match in both images, or LEFT,RIGHT."),
 )
 
 
 def pair_options(command: Command) -> Command:
     """Add options for an epipolar pair and the region to match; the command gets ``pair``, a `PairArguments`."""
-    window = click.option(
-        "--window", type=int, nargs=4, metavar="ROW COL HEIGHT WIDTH", help="Region of the left image to match."
-    )
-    return image_options(gathered("pair", _with_window, window)(command))
+    names = "--window", "region"
+    text = "Region of the left image to match."
+    return image_options(click.option(*names, type=int, nargs=4, metavar="ROW COL HEIGHT WIDTH", help=text)(command))
 
 
 _LEVEL_OPTIONS = (
     click.option("--coverage", type=float, metavar="C", help="Share of true disparities to be inside, .5 to .99."),
     click.option("--calibration", type=NAME, help="Calibration for --coverage; default the built-in one."),
-    click.option("--alpha", type=float, metavar="A", help="Level of possibility, above 0 to 1, instead of a coverage."),
+    expert_option("--alpha", type=float, metavar="A", help="Level of possibility, above 0 to 1; no coverage."),
 )
 _FIRST_SETTINGS = (
     click.option("--config", "config_file", type=FILE, help="Settings (YAML); the command line wins."),
@@ -176,17 +159,17 @@ _FIRST_SETTINGS = (
     ),
 )
 _LAST_SETTINGS = (
-    click.option(
+    expert_option(
         "--rows", type=click.Choice(("auto", "none")), help="Row offsets of the right image: taken out, or left."
     ),
-    click.option("--tile-size", type=int, help="Side of a tile's core in pixels, a multiple of 64."),
+    expert_option("--tile-size", type=int, help="Side of a tile's core in pixels, a multiple of 64."),
     click.option("--workers", type=click.IntRange(min=1), help="Tiles at once; default one per core."),
-    click.option(
+    expert_option(
         "--cluster",
         metavar="SPEC",
         help="threads (default), processes, slurm, pbs, lsf, sge, or the address of a dask scheduler.",
     ),
-    click.option(
+    expert_option(
         "--set", "named", multiple=True, metavar="KEY=VALUE", help="Any other setting, such as tiles.overlap=100."
     ),
 )
@@ -203,10 +186,7 @@ _PLACES = {
 
 
 def settings_options(command: Command, *, levels: bool = True) -> Command:
-    """Add options for settings; the command gets ``settings``, a `SettingsArguments`.
-
-    ``levels``: whether --coverage, --calibration and --alpha are among them.
-    """
+    """Add options for settings; ``levels``: also --coverage, --calibration and --alpha."""
 
     @wraps(command)
     def with_settings(
@@ -291,15 +271,15 @@ def search_options(command: Command) -> Command:
             metavar="MIN MAX",
             help="Search range in pixels, both ends searched; default: found from the images.",
         ),
-        click.option(
+        expert_option(
             "--local-range",
             is_flag=True,
             help="Search a separate range in each cell of the image, found from the images.",
         ),
-        click.option(
+        expert_option(
             "--around", type=NAME, help="Disparities of another matcher, a raster: search around them and audit them."
         ),
-        click.option("--margin", type=int, metavar="K", help="Pixels to search on both sides of --around; default 8."),
+        expert_option("--margin", type=int, metavar="K", help="Pixels to search on both sides of --around; default 8."),
     )
 
 
@@ -308,13 +288,14 @@ def run_options(command: Command) -> Command:
     with_run = gathered(
         "run",
         RunArguments,
-        click.option("--strict", is_flag=True, help="End with status 1 if the run prints a warning."),
-        click.option("--keep-tiles", is_flag=True, help="Keep the products of tiles, until a call without it."),
+        expert_option("--strict", is_flag=True, help="End with status 1 if the run prints a warning."),
+        expert_option("--keep-tiles", is_flag=True, help="Keep the products of tiles, until a call without it."),
         click.option(
             "--overwrite",
             is_flag=True,
             help="May replace another run in OUT; its tiles are deleted, equal ones are used again.",
         ),
+        json_option,
         quiet_option,
     )
     return with_run(log_options(command))

@@ -1,22 +1,47 @@
 """Options shared by commands, and checks of file names."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import wraps
+from functools import partial, wraps
 from inspect import signature
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from click.shell_completion import CompletionItem
 
 from sat_intervals.cli.logs import logged
 
+if TYPE_CHECKING:
+    from sat_intervals.cli.console import Console
+
 # Copied from `sat_intervals.config`, which --help must not import.
 PRESETS = ("satellite", "satellite-mccnn", "paper", "mccnn")
 
 # Pictures that `plot` writes to the folder of a run, without their ending.
 PICTURES = ("overview", "errors", "coverage", "range", "rows", "profile", "curve", "dsm")
+
+
+class _Expert(click.Option):
+    """An option that few runs need."""
+
+
+expert_option = partial(click.option, cls=_Expert)
+
+
+class Grouped(click.Command):
+    """A command whose help lists `expert_option` under a heading of their own, at the end."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write both lists."""
+        options = [one for one in self.get_params(ctx) if isinstance(one, click.Option)]
+        for title, is_expert in (("Options", False), ("Expert options", True)):
+            chosen = [one for one in options if isinstance(one, _Expert) == is_expert]
+            if rows := [row for one in chosen if (row := one.get_help_record(ctx))]:
+                with formatter.section(title):
+                    formatter.write_dl(rows)
+
 
 Command = Callable[..., Any]
 Decorator = Callable[[Command], Command]
@@ -51,7 +76,7 @@ def gathered(name: str, gather: Callable[..., Any], *options: Decorator) -> Deco
     def decorated(command: Command) -> Command:
         @wraps(command)
         def with_gathered(**given: Any) -> Any:
-            values = {parameter: given.pop(parameter) for parameter in parameters}
+            values = {parameter: given.pop(parameter) for parameter in parameters if parameter in given}
             return command(**{name: gather(**values)}, **given)
 
         return with_options(with_gathered, *options)
@@ -74,37 +99,47 @@ truth_option = click.option(
 )
 
 
+def _finite(context: click.Context, parameter: click.Parameter, value: float) -> float:
+    """Raise if a number of pixels is infinite or NaN, which no range of click refuses."""
+    if not math.isfinite(value):
+        raise click.BadParameter(f"{value} is not a number of pixels")
+    return value
+
+
+TOLERANCE: dict[str, Any] = {"type": click.FloatRange(min=0), "default": 0.0, "callback": _finite, "metavar": "PX"}
+tolerance_option = click.option(
+    "--tolerance",
+    **TOLERANCE,
+    help="Truth up to PX outside an interval counts as inside; for quantised truth, give half a step.",
+)
+
 SensorFiles = tuple[Path, Path, Path, Path]
 """Left and right RPC model, left and right epipolar grid."""
 
 
-def _sensor_files(models_alone: bool, **given: tuple[Path, ...]) -> list[tuple[Path, ...]]:
-    if models_alone and not (given["left_grid"] or given["right_grid"]):
-        given = {name: files for name, files in given.items() if name.endswith("model")}
-    if len({len(files) for files in given.values()}) > 1:
-        options = ", ".join("--" + name.replace("_", "-") for name in given)
-        raise click.UsageError(f"{options} go together: give {'both' if len(given) == 2 else 'all four'}.")
-    return list(zip(*given.values(), strict=True))
-
-
 def sensor_options(command: Command, *, models_alone: bool = False) -> Command:
-    """Add options for models and grids, to be given once for each run; the command gets a list of `SensorFiles`.
+    """Add options for models and grids, to be given once for each run, or models alone; the command gets a list."""
 
-    ``models_alone``: models may be given without grids; the list then has both models only.
-    """
-    names = [f"{side}_{kind}" for kind in ("model", "grid") for side in ("left", "right")]
-    texts = ("RPC model of the {} sensor image.", "Epipolar grid of the {} image.")
+    def gather(**given: tuple[Path, ...]) -> list[tuple[Path, ...]]:
+        if models_alone and not (given["left_grid"] or given["right_grid"]):
+            given = {name: files for name, files in given.items() if name.endswith("model")}
+        if len({len(files) for files in given.values()}) > 1:
+            options = ", ".join("--" + name.replace("_", "-") for name in given)
+            raise click.UsageError(f"{options} go together: give {'both' if len(given) == 2 else 'all four'}.")
+        return list(zip(*given.values(), strict=True))
 
     @wraps(command)
     def with_files(**given: Any) -> Any:
-        files = _sensor_files(models_alone, **{name: given.pop(name) for name in names})
-        return command(sensor_files=files, **given)
+        names = "left_model", "right_model", "left_grid", "right_grid"
+        return command(sensor_files=gather(**{name: given.pop(name) for name in names}), **given)
 
-    options = (
-        click.option("--" + name.replace("_", "-"), multiple=True, type=FILE, help=text.format(name.partition("_")[0]))
-        for name, text in zip(names, (texts[0], texts[0], texts[1], texts[1]), strict=True)
+    return with_options(
+        with_files,
+        click.option("--left-model", multiple=True, type=FILE, help="RPC model of the left sensor image."),
+        click.option("--right-model", multiple=True, type=FILE, help="RPC model of the right sensor image."),
+        click.option("--left-grid", multiple=True, type=FILE, help="Epipolar grid of the left image."),
+        click.option("--right-grid", multiple=True, type=FILE, help="Epipolar grid of the right image."),
     )
-    return with_options(with_files, *options)
 
 
 def note_geometry(outs: Sequence[Path], sensor_files: Sequence[SensorFiles]) -> None:
@@ -132,10 +167,7 @@ _FOR_BOTH = {"output", "overwrite", "name", "as_json", "quiet", "debug", "log_fi
 
 
 def surface_options(dsm_help: str, others: str, *of_surfaces: str) -> Decorator:
-    """Return a decorator that adds --dsm, --reference and --no-register to a command for ``others``, such as pairs.
-
-    The command gets ``surface``, a `Surface` or None. ``of_surfaces`` are its further options that need --dsm.
-    """
+    """Add --dsm, --reference and --no-register to a command for ``others``; ``of_surfaces``: what else needs --dsm."""
 
     def gather(*, dsm: Path | None, reference: Path | None, no_register: bool) -> Surface | None:
         if bool(dsm) != bool(reference):
@@ -170,6 +202,44 @@ def _check_options(has_surface: bool, others: str, of_surfaces: Sequence[str]) -
             raise click.UsageError(f"{option} applies to {others}, not to --dsm: leave it out.")
 
 
+@dataclass(frozen=True)
+class Printing:
+    """What a command prints: text, JSON, or errors only."""
+
+    as_json: bool
+    quiet: bool
+
+    @property
+    def is_silent(self) -> bool:
+        """Return whether no text is printed."""
+        return self.quiet or self.as_json
+
+    def console(self) -> "Console":
+        """Return what shows progress and prints text; it is silent beside JSON."""
+        from sat_intervals.cli.console import Console
+
+        return Console(self.is_silent)
+
+    def say(self, report: Any) -> None:
+        """Print a report if JSON is asked for."""
+        if self.as_json:
+            say_json(report)
+
+
+def printing_options(command: Command) -> Command:
+    """Add --json, --quiet and the options of the log; the command gets ``printing``."""
+    return gathered("printing", Printing, json_option, quiet_option)(log_options(command))
+
+
+def output_file(given: Path | None, default: Path, *, overwrite: bool) -> Path:
+    """Return the file to write; raise if one that is given exists and may not be replaced."""
+    from sat_intervals.raster.publishing import check_free
+
+    if given:
+        check_free(given, overwrite=overwrite)
+    return given or default
+
+
 def say_json(content: Any) -> None:
     """Print figures as JSON; NaN and infinity are null."""
     from sat_intervals.raster import as_json
@@ -187,6 +257,6 @@ def log_options(command: Command) -> Command:
 
     return with_options(
         with_log,
-        click.option("--debug", is_flag=True, help="Show the complete log, and tracebacks of errors."),
-        click.option("--log-file", type=FILE, help="Append the complete log to FILE."),
+        expert_option("--debug", is_flag=True, help="Show the complete log, and tracebacks of errors."),
+        expert_option("--log-file", type=FILE, help="Append the complete log to FILE."),
     )

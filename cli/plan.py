@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 import click
 
 from sat_intervals.cli.matching import PairArguments, SettingsArguments, pair_options, search_options
-from sat_intervals.cli.options import json_option, log_options, say_json
+from sat_intervals.cli.options import Grouped, json_option, log_options, say_json
 
 if TYPE_CHECKING:
     from sat_intervals.run.plan import Plan
 
 
-@click.command(short_help="Estimate tiles, memory, disk and time of a run.")
+@click.command(cls=Grouped, short_help="Estimate tiles, memory, disk and time of a run.")
 @search_options
 @pair_options
 @click.option(

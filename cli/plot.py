@@ -7,8 +7,7 @@ from typing import Any
 
 import click
 
-from sat_intervals.cli.judging import TOLERANCE
-from sat_intervals.cli.options import FILE, PICTURES, log_options, truth_option
+from sat_intervals.cli.options import FILE, PICTURES, TOLERANCE, log_options, truth_option
 
 
 @click.command(short_help="Draw a finished run: maps, profile of a row, errors, cost curve of a pixel.")

@@ -1,5 +1,6 @@
 """``sat-intervals range``: find the search range of a pair, with its evidence."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -7,98 +8,61 @@ import click
 
 from sat_intervals.cli.logs import warn
 from sat_intervals.cli.matching import PairArguments, pair_options
-from sat_intervals.cli.options import FILE, json_option, log_options, overwrite_option, quiet_option, say_json
+from sat_intervals.cli.options import FILE, Grouped, Printing, overwrite_option, printing_options
 
 # Bars of the histogram that are printed, each of several bins.
 _BARS = 8
 
 
-@click.command("range", short_help="Find the search range of a pair.")
+@click.command("range", cls=Grouped, short_help="Find the search range of a pair.")
 @pair_options
 @click.option("--output", type=FILE, help="Write the local ranges, for the setting disparity.grid of match.")
 @overwrite_option
-@json_option
-@quiet_option
-@log_options
-def search_range(pair: PairArguments, output: Path | None, overwrite: bool, as_json: bool, quiet: bool) -> None:
+@printing_options
+def search_range(pair: PairArguments, output: Path | None, overwrite: bool, printing: Printing) -> None:
     """Find the search range of the epipolar images LEFT and RIGHT, as match does without --disparity.
 
     Prints the range and its evidence; --output keeps the ranges of the cells. --window has no effect: a range is always
     that of the whole images.
     """
-    from sat_intervals.cli.console import Console
-    from sat_intervals.config import load_config
-    from sat_intervals.prepare.local import write_ranges
-    from sat_intervals.prepare.pair import FilePair
-    from sat_intervals.prepare.prepared import prepare
-    from sat_intervals.prepare.search_range import undeclared_lines
-    from sat_intervals.raster import files_of
-    from sat_intervals.raster.identity import check_not_replaced
-    from sat_intervals.raster.publishing import check_free
-    from sat_intervals.run.each import each_here
-    from sat_intervals.run.quality import rows_left
+    from sat_intervals.run.preparing import range_of_pair
 
-    with Console(quiet or as_json) as console:
+    with printing.console() as console:
         left, right = pair.open()
-        if output:
-            names = pair.files
-            check_not_replaced([file for name in names for file in (name, *files_of(name))], [output])
-            check_free(output, overwrite=overwrite)
-        with each_here(console.progress) as each:
-            prepared = prepare(FilePair(left, right), load_config({"rows": "none"}), each)
-        found, survey = prepared.search, prepared.survey
-        assert found  # nothing was given
-        assert survey
-        if output:
-            write_ranges(output, found.local, left)
-    if as_json:
-        say_json(found.report() | {"survey": survey.report()})
+        found, survey, warnings = range_of_pair(left, right, output, overwrite=overwrite, progress=console.progress)
+    printing.say(found.report() | {"survey": survey.report()})
+    if printing.as_json:
         return
-    for name, value in [*_rows(found), *_survey(survey)]:
+    for name, value in (*_rows(found), *_survey(survey)):
         click.echo(f"{name:<36}{value}")
-    warn([*undeclared_lines(found.undeclared, pair.images), *rows_left(survey, "auto", pair.images[1])])
+    warn(warnings)
 
 
-def _rows(found: Any) -> list[tuple[str, str]]:
-    rows = [("search range", f"{found.minimum} to {found.maximum} px")]
-    rows.append(("consistent matches", f"{100 * found.matched:.1f} % of the left pixels"))
-    rows.append(("local ranges, of the whole", f"{100 * found.local.share:.0f} %"))
+def _rows(found: Any) -> Iterator[tuple[str, str]]:
+    yield "search range", f"{found.minimum} to {found.maximum} px"
+    yield "consistent matches", f"{100 * found.matched:.1f} % of the left pixels"
+    yield "local ranges, of the whole", f"{100 * found.local.share:.0f} %"
     for level in found.levels:
         searched = f"{level.minimum} to {level.maximum} px searched, {100 * level.matched:.1f} % matched"
-        rows.append((f"  images reduced by {level.step}", searched))
-    rows += _histogram(found.histogram)
+        yield f"  images reduced by {level.step}", searched
+    edges, counts = found.histogram["edges"], found.histogram["counts"]
+    each = len(counts) // _BARS
+    for first in range(0, len(counts), each):
+        share = 100 * sum(counts[first : first + each]) / max(sum(counts), 1)
+        yield f"  {edges[first]:.0f} to {edges[first + each]:.0f} px", f"{share:.1f} % of the matches"
     for side, border in found.undeclared.items():
         share = f"{100 * border['share']:.0f} % of the pixels, along the borders"
-        rows.append((f"{side} image, value {border['value']:g}", share))
-    return rows
+        yield f"{side} image, value {border['value']:g}", share
 
 
-def _survey(survey: Any) -> list[tuple[str, str]]:
-    rows = []
+def _survey(survey: Any) -> Iterator[tuple[str, str]]:
     if survey.noise is not None:
-        rows.append(("distance of matches", f"{survey.noise:.2f} of that of random pixels"))
+        yield "distance of matches", f"{survey.noise:.2f} of that of random pixels"
     found = survey.rows
     if found is None:
-        rows.append(("rows of the two images", "not compared: too few matches"))
-    else:
-        for name, (median, most) in (
-            ("rows of the two images", found.before),
-            ("  from a smooth function", found.after),
-        ):
-            rows.append((name, f"differ by {median:.2f} px, 90 % at most {most:.2f} px"))
-        does = "taken out with rows auto" if survey.is_large and not found.contradiction else "left as they are"
-        rows.append(("  its largest", f"{found.most:.2f} px, of {found.matches} matches; {does}"))
-    return rows
-
-
-def _histogram(histogram: dict[str, list[float]]) -> list[tuple[str, str]]:
-    edges, counts = histogram["edges"], histogram["counts"]
-    each = len(counts) // _BARS
-    bars = [sum(counts[first : first + each]) for first in range(0, len(counts), each)]
-    return [
-        (
-            f"  {edges[each * i]:.0f} to {edges[each * (i + 1)]:.0f} px",
-            f"{100 * bar / max(sum(bars), 1):.1f} % of the matches",
-        )
-        for i, bar in enumerate(bars)
-    ]
+        yield "rows of the two images", "not compared: too few matches"
+        return
+    for name, (median, most) in (("rows of the two images", found.before), ("  from a smooth function", found.after)):
+        yield name, f"differ by {median:.2f} px, 90 % at most {most:.2f} px"
+    does = "taken out with rows auto" if survey.is_large and not found.contradiction else "left as they are"
+    yield "  its largest", f"{found.most:.2f} px, of {found.matches} matches; {does}"

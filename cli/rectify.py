@@ -10,12 +10,12 @@ from sat_intervals.cli.matching import PairArguments, image_options
 from sat_intervals.cli.options import (
     FILE,
     Command,
+    Grouped,
+    Printing,
+    expert_option,
     gathered,
-    json_option,
-    log_options,
     overwrite_option,
-    quiet_option,
-    say_json,
+    printing_options,
 )
 
 if TYPE_CHECKING:
@@ -32,13 +32,13 @@ def raw_options(command: Command) -> Command:
         "raw",
         _raw,
         click.option("--dem", type=FILE, help="Raw images: DEM whose heights have disparity 0."),
-        click.option(
+        expert_option(
             "--altitude",
             type=float,
             metavar="METRES",
             help="Raw images: height above the ellipsoid that has disparity 0; default the middle of the ground's.",
         ),
-        click.option(
+        expert_option(
             "--resolution-of",
             type=click.Choice(("coarser", "left")),
             help="Raw images: whose pixel size to take if they differ by more than 10 %; default coarser.",
@@ -46,7 +46,7 @@ def raw_options(command: Command) -> Command:
     )(command)
 
 
-@click.command(short_help="Make an epipolar pair of two raw images.")
+@click.command(cls=Grouped, short_help="Make an epipolar pair of two raw images.")
 @image_options
 @click.argument("out", type=FILE)
 @click.option("--left-model", type=FILE, help="RPC model of the left image; default that in or beside it.")
@@ -54,20 +54,8 @@ def raw_options(command: Command) -> Command:
 @raw_options
 @click.option("--geoid", type=FILE, help="Geoid grid that heights of --dem refer to; default the ellipsoid.")
 @overwrite_option
-@json_option
-@quiet_option
-@log_options
-def rectify(
-    pair: PairArguments,
-    out: Path,
-    left_model: Path | None,
-    right_model: Path | None,
-    raw: dict[str, Any],
-    geoid: Path | None,
-    overwrite: bool,
-    as_json: bool,
-    quiet: bool,
-) -> None:
+@printing_options
+def rectify(pair: PairArguments, out: Path, raw: dict[str, Any], printing: Printing, **more: Any) -> None:
     """Resample the raw images LEFT and RIGHT, with RPC models, to an epipolar pair in the folder OUT.
 
     \b
@@ -81,16 +69,13 @@ def rectify(
     `surface` does all of it. Models: RPC in tags of GeoTIFF or NITF, .RPB, _RPC.TXT, DIMAP XML, .geom.
     Needs shareloc: pip install 'sat-intervals[dsm]'.
     """  # noqa: D301 (click's mark of a preformatted paragraph)
-    from sat_intervals.cli.console import Console
     from sat_intervals.workflows.rectify import rectify
 
     left, right = pair.open()
-    raw |= {"left_model": left_model, "right_model": right_model, "geoid": geoid}
-    with Console(quiet or as_json) as console:
-        record = rectify(left, right, out, **raw, overwrite=overwrite, progress=console.progress)
+    with printing.console() as console:
+        record = rectify(left, right, out, **raw, **more, progress=console.progress)
         say_rectified(console, record)
-    if as_json:
-        say_json(record)
+    printing.say(record)
     for name in ("left.tif", "right.tif", "left_grid.tif", "right_grid.tif", "rectify.json"):
         console.say(str(out / name))
 

@@ -8,13 +8,13 @@ import click
 from sat_intervals.cli.logs import warn
 from sat_intervals.cli.options import (
     FILE,
+    Grouped,
+    Printing,
     SensorFiles,
-    json_option,
-    log_options,
     note_geometry,
+    output_file,
     overwrite_option,
-    quiet_option,
-    say_json,
+    printing_options,
     sensor_options,
 )
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _SUSPECT_ROWS = 0.5
 
 
-@click.command(short_help="Turn reference heights into true disparities of a run.")
+@click.command(cls=Grouped, short_help="Turn reference heights into true disparities of a run.")
 @click.argument("out", type=FILE)
 @click.option("--heights", type=FILE, help="Raster of heights, in any CRS.")
 @click.option("--points", type=FILE, help="Points: CSV, Parquet, LAS, LAZ, GeoPackage.")
@@ -36,9 +36,7 @@ _SUSPECT_ROWS = 0.5
 @click.option("--output", type=FILE, help="File to write; default truth.tif in OUT.")
 @overwrite_option
 @sensor_options
-@json_option
-@quiet_option
-@log_options
+@printing_options
 def reference(
     out: Path,
     heights: Path | None,
@@ -50,8 +48,7 @@ def reference(
     output: Path | None,
     overwrite: bool,
     sensor_files: list[SensorFiles],
-    as_json: bool,
-    quiet: bool,
+    printing: Printing,
 ) -> None:
     """Write the disparities that reference heights have in the finished run OUT: OUT/truth.tif.
 
@@ -69,16 +66,13 @@ def reference(
         raise click.UsageError("give either --heights or --points.")
     if ellipsoid and geoid:
         raise click.UsageError("--ellipsoid and --geoid exclude each other.")
-    from sat_intervals.cli.console import Console
     from sat_intervals.heights.reference import Reference, make_truth
     from sat_intervals.raster import Vertical
-    from sat_intervals.raster.publishing import check_free
 
-    if output:
-        check_free(output, overwrite=overwrite)
+    target = output_file(output, out / "truth.tif", overwrite=overwrite)
     vertical = Vertical(ellipsoid, geoid)
     given = Reference(heights or points, points is not None, vertical, crs)  # type: ignore[arg-type]
-    with Console(quiet or as_json) as console:
+    with printing.console() as console:
         note_geometry([out], sensor_files)
         report = make_truth(out, given, path=output, registers=not no_register, progress=console.progress)
     _say_fit(console, out, given.path, report)
@@ -86,9 +80,8 @@ def reference(
         f"{report['pixels']} pixels with a true disparity ({100 * report['share']:.1f} %), "
         f"{100 * report['outside_range']:.1f} % of them outside the search range"
     )
-    console.say(str(output or out / "truth.tif"))
-    if as_json:
-        say_json(report)
+    console.say(str(target))
+    printing.say(report)
 
 
 def _say_fit(console: "Console", out: Path, heights: Path, report: dict[str, Any]) -> None:

@@ -26,15 +26,6 @@ class Ended(KeyboardInterrupt):
 _received: list[Ended] = []
 
 
-def check() -> None:
-    """Raise `Ended` if a signal was received.
-
-    Python discards exceptions that a signal handler raises inside a destructor.
-    """
-    if _received:
-        raise _received[0]
-
-
 @contextmanager
 def armed() -> Iterator[None]:
     """Raise `Ended` on the first Ctrl-C or SIGTERM."""

@@ -15,11 +15,11 @@ from sat_intervals.cli.matching import (
     run_options,
     search_options,
 )
-from sat_intervals.cli.options import FILE, json_option, say_json, sensor_options
+from sat_intervals.cli.options import FILE, Grouped, sensor_options
 from sat_intervals.cli.rectify import raw_options, say_rectified
 
 
-@click.command(short_help="Match a pair and make a surface model.")
+@click.command(cls=Grouped, short_help="Match a pair and make a surface model.")
 @search_options
 @pair_options
 @click.argument("out", type=FILE)
@@ -27,7 +27,6 @@ from sat_intervals.cli.rectify import raw_options, say_rectified
 @raw_options
 @cell_options
 @calibration_option("--height-calibration")
-@json_option
 @run_options
 def surface(
     pair: PairArguments,
@@ -35,7 +34,6 @@ def surface(
     sensor_files: list[tuple[Path, ...]],
     raw: dict[str, Any],
     cells: dict[str, Any],
-    as_json: bool,
     settings: SettingsArguments,
     run: RunArguments,
 ) -> None:
@@ -47,8 +45,6 @@ def surface(
     The same as `rectify`, `match` and `dsm`, with their options and files. To resume, rerun the same command: what is
     finished with these images and settings is kept, the surface is made again.
     """
-    from sat_intervals.cli.console import Console
-    from sat_intervals.run.beside import compiled_beside
     from sat_intervals.workflows.surface import FILES, surface
 
     if len(sensor_files) > 1:
@@ -56,7 +52,7 @@ def surface(
     left, right = pair.open()
     settings.check_kept(out, *(out / name for name in FILES))
     config = settings.load()
-    with Console(run.quiet or as_json) as console, compiled_beside(config):
+    with run.console() as console:
         done = surface(
             left,
             right,
@@ -71,8 +67,7 @@ def surface(
             progress=console.progress,
             on_rectified=partial(say_rectified, console),
         )
-    if as_json:
-        say_json(done)
+    run.say(done)
     console.summary(done["run"], out)
     say_surface(console, done["surface"])
     console.say(str(out / "dsm.tif"))

@@ -1,7 +1,7 @@
 """Print tables."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 _WIDEST = 10_000
 # What the nominal level of intervals is, in reports and for a reader.
 _NOMINAL = {"coverage": "coverage asked for", "alpha": "alpha"}
-_EXPECTED = ("all", "high", "low", "lowest", "mean width", "median width", "score")
+_EXPECTED = ("all", "high", "low", "lowest", "mean_width", "median_width", "score")
 
 
 def show(header: Sequence[str], rows: Sequence[Sequence[str]], title: str) -> None:
@@ -42,7 +42,10 @@ def show_scenes(scenes: Sequence[SceneMetrics]) -> None:
         for row in table_1(scenes)
     ]
     show(["", "scenes", f">= {OBJECTIVE}", *TABLE_1], groups, "means over scenes, valid pixels")
-    _show_missed(scenes)
+    accuracies = {scene.name: look_up(scene.report, ACCURACY) for scene in scenes}
+    missed = [f"{name} ({_figure(value)})" for name, value in accuracies.items() if (value or 0.0) < OBJECTIVE]
+    if missed:
+        click.echo(f"below {OBJECTIVE}: {', '.join(missed)}")
     paths = [
         ("nominal",), ("all", "accuracy"), ("high", "accuracy"), ("low", "accuracy"), ("all", "mean_width"),
         ("all", "median_width"), ("all", "interval_score"), ("median_error",),
@@ -54,14 +57,6 @@ def show_scenes(scenes: Sequence[SceneMetrics]) -> None:
     header = ["", nominal, "coverage", "high", "low", "mean width", "median width", "score", "median error"]
     rows = [[name, *map(_figure, values)] for name, values in figures.items()]
     show(header, rows, f"{nominal}, measured coverage, widths, interval score and disparity - truth (px)")
-
-
-def _show_missed(scenes: Sequence[SceneMetrics]) -> None:
-    """List the scenes below the paper's objective."""
-    accuracies = {scene.name: look_up(scene.report, ACCURACY) for scene in scenes}
-    missed = [f"{name} ({_figure(value)})" for name, value in accuracies.items() if (value or 0.0) < OBJECTIVE]
-    if missed:
-        click.echo(f"below {OBJECTIVE}: {', '.join(missed)}")
 
 
 def show_scene(scene: SceneMetrics) -> None:
@@ -191,18 +186,14 @@ def show_calibration(calibration: "Calibration", expected: Sequence[dict[str, fl
     rows = []
     for row, levels in zip(expected, calibration.levels, strict=True):
         quantile = "none" if levels.quantile is None else f"{levels.quantile:g}"
-        rows.append([f"{levels.coverage:g}", *_expected(row), f"{levels.high:.4g}", f"{levels.low:.1f}", quantile])
+        figures = [_figure(row.get(key)) for key in _EXPECTED]
+        rows.append([f"{levels.coverage:g}", *figures, f"{levels.high:.4g}", f"{levels.low:.1f}", quantile])
     is_factor = (calibration.key["refinement"] or {}).get("method") == "least_squares"
-    header = ["coverage", *_EXPECTED, "factor high" if is_factor else "level high", "level low", "quantile"]
+    names = [key.replace("_", " ") for key in _EXPECTED]
+    header = ["coverage", *names, "factor high" if is_factor else "level high", "level low", "quantile"]
     show(header, rows, "expected: coverage, widths and score (px) of pairs left out, and levels")
     for note in calibration.provenance["notes"]:
         click.echo(note)
-
-
-def _expected(figures: Mapping[str, float]) -> list[str]:
-    """Format the figures of pairs left out, under the headings _EXPECTED."""
-    keys = "all", "high", "low", "lowest", "mean_width", "median_width", "score"
-    return [_figure(figures.get(key)) for key in keys]
 
 
 def _areas(report: dict[str, Any], where: str) -> list[list[str]]:

@@ -8,13 +8,13 @@ import click
 from sat_intervals.cli.logs import warn
 from sat_intervals.cli.options import (
     FILE,
+    Grouped,
+    Printing,
     SensorFiles,
-    json_option,
-    log_options,
     note_geometry,
+    output_file,
     overwrite_option,
-    quiet_option,
-    say_json,
+    printing_options,
     sensor_options,
 )
 
@@ -22,21 +22,14 @@ if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
 
 
-@click.command(short_help="Export the points of a run with height bounds.")
+@click.command(cls=Grouped, short_help="Export the points of a run with height bounds.")
 @click.argument("out", type=FILE)
 @click.option("--output", type=FILE, help="File to write: .tif, .laz or .las; default points.tif in OUT.")
 @overwrite_option
 @sensor_options
-@json_option
-@quiet_option
-@log_options
+@printing_options
 def triangulate(
-    out: Path,
-    output: Path | None,
-    overwrite: bool,
-    sensor_files: list[SensorFiles],
-    as_json: bool,
-    quiet: bool,
+    out: Path, output: Path | None, overwrite: bool, sensor_files: list[SensorFiles], printing: Printing
 ) -> None:
     """Write the points of the finished run in the folder OUT; `dsm` does not need them.
 
@@ -49,18 +42,13 @@ def triangulate(
     Heights are above the ellipsoid of WGS 84. Models and grids are those of `dsm`.
     Needs shareloc: pip install 'sat-intervals[dsm]'.
     """  # noqa: D301 (\b keeps the line breaks in click)
-    from sat_intervals.cli.console import Console
     from sat_intervals.heights.triangulate import triangulate
-    from sat_intervals.raster.publishing import check_free
 
-    if output:
-        check_free(output, overwrite=overwrite)
-    output = output or out / "points.tif"
-    with Console(quiet or as_json) as console:
+    output = output_file(output, out / "points.tif", overwrite=overwrite)
+    with printing.console() as console:
         note_geometry([out], sensor_files)
         report = triangulate(out, output, console.progress)
-    if as_json:
-        say_json(report)
+    printing.say(report)
     if report["points"]:
         lowest, highest = report["height"]
         console.say(f"{report['points']} points between {lowest:.1f} and {highest:.1f} m above the ellipsoid")

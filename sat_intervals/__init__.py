@@ -25,38 +25,18 @@ if typing.TYPE_CHECKING:
     from sat_intervals.raster import open_image
     from sat_intervals.run.pair import match_pair
     from sat_intervals.tiling import Window
+    from sat_intervals.workflows.calibrate import calibrate
     from sat_intervals.workflows.rectify import rectify
     from sat_intervals.workflows.surface import surface
 
     __version__: str
 
 __all__ = [
-    "Config",
-    "RunError",
-    "SatIntervalsError",
-    "SurfaceChoices",
-    "Window",
-    "__version__",
-    "calibrate_surface",
-    "calibrate_volumes",
-    "decode_flags",
-    "evaluate_run",
-    "evaluate_surface",
-    "intervals_around",
-    "intervals_of",
-    "load_config",
-    "load_height_calibration",
-    "make_surface",
-    "match_arrays",
-    "match_pair",
-    "open",
-    "open_image",
-    "open_surface",
-    "rectify",
-    "set_geometry",
-    "surface",
-    "triangulate",
-]
+    "Config", "RunError", "SatIntervalsError", "SurfaceChoices", "Window", "__version__", "calibrate",
+    "calibrate_surface", "calibrate_volumes", "decode_flags", "evaluate_run", "evaluate_surface", "intervals_around",
+    "intervals_of", "load_config", "load_height_calibration", "make_surface", "match_arrays", "match_pair", "open",
+    "open_image", "open_surface", "rectify", "set_geometry", "surface", "triangulate",
+]  # fmt: skip
 
 logging.getLogger(__name__).addHandler(logging.NullHandler())  # the application configures logging
 
@@ -66,6 +46,7 @@ _HOMES = {
     "SatIntervalsError": "errors",
     "SurfaceChoices": "heights.choices",
     "Window": "tiling",
+    "calibrate": "workflows.calibrate",
     "calibrate_surface": "evaluate.surface_calibration",
     "calibrate_volumes": "match.calibrate_volumes",
     "decode_flags": "interop.dataset",

@@ -49,11 +49,7 @@ def _numbers(file: Path) -> list[int]:
 
 
 def _cgroups(root: Path, controller: str) -> Iterator[Path]:
-    """Yield the folders of this process's cgroup and of its ancestors in ``/sys/fs/cgroup``.
-
-    A controller either has its own hierarchy (version 1) or belongs to the common one (version 2). A container may see
-    only the part below its own cgroup, which is then the top: folders named after what is above it are missing.
-    """
+    """Yield the folders of this process's cgroup and of its ancestors, of versions 1 and 2; some may be missing."""
     try:
         groups = (root / "proc/self/cgroup").read_text(errors="surrogateescape").splitlines()
     except OSError:  # not Linux

@@ -30,10 +30,11 @@ class Config(sections.Section):
     rows: Literal["auto", "none"] = Field(
         "auto", description="row offsets of the right image: measured and taken out, or left"
     )
+    interval: Interval | None = Interval()
+    # From here to `regularization` a calibration belongs to the settings, see `key_of`.
     cost: AnyCost = Census()
     sgm: AnySgm | None = Sgm()
     ambiguity: sections.Ambiguity | None = sections.Ambiguity()
-    interval: Interval | None = Interval()
     refinement: sections.Refinement | None = sections.Refinement()
     cross_check: sections.CrossCheck | None = sections.CrossCheck()
     median: sections.Median | None = sections.Median()

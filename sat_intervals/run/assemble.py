@@ -104,8 +104,8 @@ def _copy_parts(
     job: Job, writer: OutputWriter, metas: Mapping[PartKey, Mapping[str, Any]], workers: Workers, progress: Progress
 ) -> None:
     """Copy the finished parts of a run into its files, on workers that share its folder, else in this process."""
-    files, of = files_of_run(job.config), parts_of(job)
-    copied, total, retries = list[str | None](), len(files) * len(metas), job.config.cluster.retries
+    files, of, retries = files_of_run(job.config), parts_of(job), job.config.cluster.retries
+    copied: list[str | None] = []
     with nullcontext(workers) if job.is_home else closing(Threads(_THREADS)) as copiers:
 
         def copy_parts(path: Path, parts: Iterable[tuple[int, Part]]) -> None:
@@ -117,7 +117,7 @@ def _copy_parts(
                 copied.append(name)
 
         def look(_: int) -> None:
-            progress("files", len(copied), total)
+            progress("files", len(copied), len(files) * len(metas))
 
         look(0)
         for file in files:

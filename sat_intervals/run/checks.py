@@ -1,4 +1,4 @@
-"""Check that a pair can be matched with the memory that there is, before its tiles."""
+"""Check that a pair can be matched with the memory that there is, before its tiles; what it needs on disks."""
 
 from pathlib import Path
 
@@ -7,8 +7,11 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.machine import usable_cores
 from sat_intervals.match.costs import check_cost
 from sat_intervals.match.memory import check_memory, check_strips, fitted, strip_bytes, volume_bytes
-from sat_intervals.raster import BLOCK, Image, check_pair, open_image
-from sat_intervals.run.workers import parse_memory, readers
+from sat_intervals.match.schedule import handed_bytes
+from sat_intervals.raster import BLOCK, Image, check_pair, file_bytes, open_image, part_bytes
+from sat_intervals.run.state import files_of_run
+from sat_intervals.run.workers import is_remote, parse_memory, readers
+from sat_intervals.store.tiles import store_bytes
 from sat_intervals.tiling import Grid, Window
 
 
@@ -69,3 +72,12 @@ def check_tiles(config: Config, region: Window) -> None:
         f"strips of {rows} x {region.width} pixels, {strips} at once,",
         "choose fewer --workers or a narrower --window",
     )
+
+
+def disk_bytes(grid: Grid, config: Config, images: tuple[Image, Image]) -> tuple[int, int, int]:
+    """Return the bytes of tiles and what they hand on, of parts of files, and of the files, at most."""
+    region, files = grid.region, files_of_run(config)
+    tiles = store_bytes(grid, has_coverage=config.has_coverage)
+    handed = handed_bytes(grid, config, images, keeps_pixels=not is_remote(config.cluster))
+    size = region.height, region.width
+    return tiles + handed, part_bytes(files, *size), file_bytes(files, *size)

@@ -4,19 +4,18 @@ from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
 from threading import Lock
-from typing import Any, Self
 
 from sat_intervals.config import Cluster
 from sat_intervals.run.workers import Outcome, Task, Threads, Workers, cores_of_process, readers
 
 
-class Connection:
+class Connection(ExitStack):
     """Workers that are started, or connected to, for the first tasks, and closed at the end; see `Workers`."""
 
     def __init__(self, settings: Cluster, out: Path) -> None:
         """``out`` is the folder for logs of jobs."""
-        self._settings, self._out = settings, out
-        self._stack, self._lock = ExitStack(), Lock()
+        super().__init__()
+        self._settings, self._out, self._lock = settings, out, Lock()
         self._workers: Workers | None = None
 
     def outcomes(self, tasks: Iterator[Task | None]) -> Iterator[Outcome | None]:
@@ -28,13 +27,7 @@ class Connection:
     def _started(self) -> Workers:
         settings = self._settings
         if settings.kind == "threads":
-            return self._stack.enter_context(closing(Threads(cores_of_process(settings), readers(settings))))
+            return self.enter_context(closing(Threads(cores_of_process(settings), readers(settings))))
         from sat_intervals.run.submit import DaskWorkers, connected
 
-        return DaskWorkers(self._stack.enter_context(connected(settings, self._out)))
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        self._stack.__exit__(*error)
+        return DaskWorkers(self.enter_context(connected(settings, self._out)))

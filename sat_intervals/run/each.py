@@ -1,15 +1,11 @@
 """Prepare pairs with workers: what `prepare` calls for each block runs on them."""
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NoReturn
 
-from sat_intervals.config import Cluster
 from sat_intervals.errors import RunError
 from sat_intervals.progress import Progress
-from sat_intervals.run.connection import Connection
 from sat_intervals.run.workers import Task, Workers, picklable_errors, reason, results
 
 _RETRIES = 2
@@ -41,10 +37,3 @@ _FOUND = {"range": "the search range", "rows": "row offsets", "images": "mean an
 def _called(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
     with picklable_errors():
         return function(*arguments)
-
-
-@contextmanager
-def each_here(progress: Progress) -> Iterator[EachOnWorkers]:
-    """Yield what uses the cores of this machine."""
-    with Connection(Cluster(), Path()) as connection:
-        yield EachOnWorkers(connection, progress)

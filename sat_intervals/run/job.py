@@ -13,24 +13,17 @@ from sat_intervals.errors import RunError
 from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.matching_cost import VolumeOf
-from sat_intervals.match.schedule import blocks_of, handed_bytes
+from sat_intervals.match.schedule import blocks_of
 from sat_intervals.prepare.pair import Each, FilePair, here
 from sat_intervals.prepare.prepared import Prepared, prepare
-from sat_intervals.raster import (
-    Image,
-    check_space,
-    file_bytes,
-    files_of,
-    part_bytes,
-)
+from sat_intervals.raster import Image, check_space, files_of
 from sat_intervals.raster.identity import absolute_in, check_not_replaced, identities, relative_in
-from sat_intervals.run.checks import check_tiles, checked_pair, checked_region, fitted_to_jobs
+from sat_intervals.run.checks import check_tiles, checked_pair, checked_region, disk_bytes, fitted_to_jobs
 from sat_intervals.run.inputs import describe_inputs
-from sat_intervals.run.state import OUTPUTS, check_folder, files_of_run, next_step, read_report
-from sat_intervals.run.workers import is_remote
+from sat_intervals.run.state import OUTPUTS, check_folder, next_step, read_report
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import MANIFEST, PLACE, StoreError, digest, place_of, read_manifest, write_manifest
-from sat_intervals.store.tiles import LAYOUT, ONCE, PARTS, TILES, DamagedTilesError, Store, home_of, store_bytes
+from sat_intervals.store.tiles import LAYOUT, ONCE, PARTS, TILES, DamagedTilesError, Store, home_of
 from sat_intervals.tiling import Grid, Tile, Window
 
 # Settings without effect on tiles; those of the preset itself are listed one by one.
@@ -126,15 +119,10 @@ class Job:
 
     def _check_space(self) -> None:
         """Raise if disks have no room for what a run has yet to write."""
-        region, files = self.store.grid.region, files_of_run(self.config)
+        tiles, parts, final = disk_bytes(self.store.grid, self.config, (self.left, self.right))
         share = len(self.waiting()) / len(self.store.grid)
-        tiles = store_bytes(self.store.grid, has_coverage=self.config.has_coverage)
-        handed = handed_bytes(
-            self.store.grid, self.config, (self.left, self.right), keeps_pixels=not is_remote(self.config.cluster)
-        )
-        parts = self.has_files * part_bytes(files, region.height, region.width)
-        before = share * (tiles + handed) + max(0, parts - sum(self.store.folder.sizes(PARTS).values()))
-        final = self.has_files * file_bytes(files, region.height, region.width)
+        before = share * tiles + max(0, self.has_files * parts - sum(self.store.folder.sizes(PARTS).values()))
+        final *= self.has_files
         if self.is_home:
             check_space(self.out, round(before + final), "tiles, files and their parts")
             return
@@ -216,9 +204,11 @@ def job_of(
     prepared = replace(prepared, config=config)
     read = [*identities(inputs), *(files_of(config.disparity.grid) if config.disparity.grid else ())]
     manifest = _manifest(prepared, relative_in(out, inputs), region)
-    run, store, home = digest(manifest), config.cluster.store, folder_at(home_of(out))
-    folder = folder_at(f"{folder_at(store)}/{'-'.join(filter(None, (pair, run)))}" if store else home_of(out))
-    manifest[PLACE] = None if folder == home else str(folder)
+    run = digest(manifest)
+    folder = folder_at(home_of(out))
+    if config.cluster.store:
+        folder = folder_at(f"{folder_at(config.cluster.store)}/{'-'.join(filter(None, (pair, run)))}")
+    manifest[PLACE] = None if folder == folder_at(home_of(out)) else str(folder)
     check_not_replaced(read, [out / name for name in OUTPUTS], [home_of(out)])
     kept = Store(folder, Grid(region, config.tiles.size), run)
     return Job(prepared, kept, out, manifest, requested, overwrite)

@@ -16,13 +16,7 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.match.gauge import OF_FITS, Gauge, at_levels, block_numbers, pairs_of
 from sat_intervals.match.histogram import bias_histogram
 from sat_intervals.match.measurement import QUANTILES, Measured, ThresholdSweep, threshold_sweep
-from sat_intervals.match.postprocess import (
-    ConfidenceScale,
-    RawRows,
-    filter_rows,
-    halo,
-    with_halo,
-)
+from sat_intervals.match.postprocess import ConfidenceScale, RawRows, filter_rows, halo, with_halo
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.prepare.pair import FilePair
 from sat_intervals.prepare.prepared import Prepared, prepare

@@ -82,7 +82,8 @@ def match_pair(
     RunError
         Tiles failed; no output was published.
     """
-    config, out, seconds = _named(load_config(config), volume_of), Path(out), dict[str, float]()
+    config, out = _named(load_config(config), volume_of), Path(out)
+    seconds: dict[str, float] = {}
     with Connection(config.cluster, out) as connection:
         with logged_stage(seconds, "start"):
             each = EachOnWorkers(connection, progress)
@@ -94,7 +95,7 @@ def match_pair(
             else:
                 with logged_stage(seconds, "kernels"):
                     progress("kernels", 0, 1)
-                    compile_kernels(job.config, hands_states_on=job.hands_states_on)
+                    compile_for(job)
                     progress("kernels", 1, 1)
                 report = match_and_assemble(job, connection, seconds, progress)
             end_tiles(job, keep_tiles=keep_tiles)
@@ -118,6 +119,11 @@ def _named(config: Config, volume_of: VolumeOf | None) -> Config:
             f"volume_of is {volume_of!r}: name it and its version in cost.name, by which a run knows what to resume"
         )
     return config.model_copy(update={"cost": config.cost.model_copy(update={"name": name})})
+
+
+def compile_for(job: Job) -> None:
+    """Compile or load the kernels of a run, before its tiles."""
+    compile_kernels(job.config, hands_states_on=job.hands_states_on)
 
 
 def complete_before(job: Job) -> dict[str, Any]:

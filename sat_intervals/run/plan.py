@@ -8,18 +8,13 @@ from typing import Any
 from sat_intervals.config import Cluster, Config, load_config, resolved
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.memory import PROCESS_BYTES, check_strips, fitted, strip_bytes, tile_bytes, waiting_bytes
-from sat_intervals.match.schedule import handed_bytes
 from sat_intervals.match.warm_up import compile_kernels
-from sat_intervals.prepare.pair import FilePair
-from sat_intervals.prepare.prepared import prepare
 from sat_intervals.progress import Progress
-from sat_intervals.raster import BLOCK, Image, file_bytes, part_bytes
-from sat_intervals.run.checks import check_tiles, checked_pair, checked_region, fitted_to_jobs
-from sat_intervals.run.each import each_here
+from sat_intervals.raster import BLOCK, Image
+from sat_intervals.run.checks import check_tiles, checked_pair, checked_region, disk_bytes, fitted_to_jobs
 from sat_intervals.run.pair import match_pair
-from sat_intervals.run.state import files_of_run
-from sat_intervals.run.workers import cores_of_process, is_remote, readers, reason, tiles_at_once
-from sat_intervals.store.tiles import store_bytes
+from sat_intervals.run.preparing import prepared_here
+from sat_intervals.run.workers import cores_of_process, readers, reason, tiles_at_once
 from sat_intervals.tiling import Grid, Window
 
 # Side of the sample, a window at the centre of the image; with exact seams up to twice as high and four times as wide.
@@ -60,7 +55,9 @@ def plan(
     config = resolved(load_config(config))
     left, right = checked_pair(left, right, config)
     region = checked_region(left, window)
-    config = _searched(FilePair(left, right), config, progress)
+    if config.disparity.is_auto or config.disparity.is_local:
+        found = prepared_here(left, right, config, progress, measures_rows=False)
+        config = config.model_copy(update={"disparity": found.config.disparity})
     config = fitted_to_jobs(config) if memory is None else fitted(config, memory, waiting=readers(config.cluster))
     workers = workers or tiles_at_once(config.cluster)
     strip = min(BLOCK, region.height), region.width
@@ -72,7 +69,6 @@ def plan(
     progress("kernels", 0, 1)
     compile_kernels(config)
     seconds, extra = _expected(left, right, config, workers, grid)
-    files = files_of_run(config)
     together = workers if config.cluster.kind == "threads" else cores_of_process(config.cluster)
     waiting = readers(config.cluster) * waiting_bytes(config)
     task = max(tile_bytes(config), strip_bytes(*strip, config))
@@ -85,21 +81,9 @@ def plan(
         worker_bytes=PROCESS_BYTES + waiting + task,
         together=together,
         together_bytes=PROCESS_BYTES + waiting + together * task,
-        disk_bytes=store_bytes(grid, has_coverage=config.has_coverage)
-        + part_bytes(files, region.height, region.width)
-        + file_bytes(files, region.height, region.width)
-        + handed_bytes(grid, config, (left, right), keeps_pixels=not is_remote(config.cluster)),
+        disk_bytes=sum(disk_bytes(grid, config, (left, right))),
         seconds=seconds,
     )
-
-
-def _searched(pair: FilePair, config: Config, progress: Progress) -> Config:
-    """Return the settings with the search range as numbers; rows are not looked at."""
-    if not (config.disparity.is_auto or config.disparity.is_local):
-        return config
-    with each_here(progress) as each:
-        found = prepare(pair, config.model_copy(update={"rows": "none"}), each, measures_rows=False)
-    return config.model_copy(update={"disparity": found.config.disparity})
 
 
 def _work(grid: Grid, config: Config) -> int:

@@ -35,11 +35,7 @@ _ROW_OFFSET, _NOISE = 1.0, 0.55
 
 
 def quality_of(job: Job, tables: Tables) -> dict[str, Any]:
-    """Return the quality of a pair.
-
-    ``noise``, see `noise_of`; ``undeclared``, see `Found`; ``no_data``, the share of pixels without data that
-    tiles have read of each side; ``same``, whether both images have the same pixels.
-    """
+    """Return ``noise``; ``undeclared``, see `Found`; ``no_data``, shares by side; ``same``: of equal images."""
     looked = _look(job.left, job.right, job.store.grid.region) | {"no_data": _no_data(job, tables)}
     looked["undeclared"] |= job.prepared.search.undeclared if job.prepared.search else {}
     return looked | {"noise": job.prepared.survey and job.prepared.survey.noise}

@@ -1,7 +1,4 @@
-"""Clusters of dask, and tasks on them, a bounded number at a time; dask repeats these and replaces lost workers.
-
-A cluster is processes of this machine, an existing scheduler, or jobs of a batch system.
-"""
+"""Clusters of dask, and tasks on them, a bounded number at a time; dask repeats these and replaces lost workers."""
 
 import asyncio
 import itertools

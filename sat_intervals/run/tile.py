@@ -11,14 +11,7 @@ from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.kernels.sgm import LAST, WAVEFRONTS, Borders, Edge
 from sat_intervals.match.borders import Border, Place, borders_of, in_order, rehulled, sources, trace_area
 from sat_intervals.match.local_ranges import LocalRanges, narrowed
-from sat_intervals.match.patch import (
-    Patch,
-    PatchFrame,
-    frame_area,
-    frames_of,
-    match_patch,
-    path_window,
-)
+from sat_intervals.match.patch import Patch, PatchFrame, frame_area, frames_of, match_patch, path_window
 from sat_intervals.match.schedule import Step, needs
 from sat_intervals.products import NO_DISPARITY
 from sat_intervals.progress import timed

@@ -1,7 +1,7 @@
 """The files of a run's steps: one `.npz` for each tile and step, whose existence says that the step is done."""
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -60,19 +60,15 @@ class Store:
 
     def read(self, kind: str, name: str, wanted: Collection[str] | None = None) -> list[np.ndarray] | None:
         """Read all arrays of a file, or the ``wanted`` ones; None if it is missing or damaged."""
-        try:
-            with self.opened(kind, name) as archive:
-                return [archive[key].copy() for key in (archive.names() if wanted is None else wanted)]
-        except DamagedFileError:
-            return None
+        with suppress(DamagedFileError), self.opened(kind, name) as archive:
+            return [archive[key].copy() for key in (archive.names() if wanted is None else wanted)]
+        return None
 
     def meta(self, kind: str, name: str, of: str = "") -> dict[str, Any] | None:
         """Read what a file has beside arrays; None if it is missing or damaged."""
-        try:
-            with self.opened(kind, name, of) as archive:
-                return archive.meta
-        except DamagedFileError:
-            return None
+        with suppress(DamagedFileError), self.opened(kind, name, of) as archive:
+            return archive.meta
+        return None
 
     def names(self, kind: str) -> set[str]:
         """Return the names of the files of a kind."""
@@ -90,11 +86,9 @@ class Store:
 
     def is_intact(self, kind: str, name: str) -> bool:
         """Return whether a file is there and all of it agrees with its checksums."""
-        try:
-            with self.opened(kind, name) as archive:
-                return archive.is_intact()
-        except DamagedFileError:
-            return False
+        with suppress(DamagedFileError), self.opened(kind, name) as archive:
+            return archive.is_intact()
+        return False
 
     def failures(self) -> dict[str, str]:
         """Return why tiles failed, by name, without those done since."""
@@ -103,11 +97,7 @@ class Store:
 
     # ---- Tiles ---------------------------------------------------------------------------------------------
     def write_tile(self, tile: Tile, arrays: Mapping[str, np.ndarray], **meta: Any) -> None:
-        """Write the products of a tile.
-
-        ``arrays`` are the fields of `Raw` of the core's shape, ``right_cost`` and ``right_winner`` of the right view,
-        and ``histogram``.
-        """
+        """Write the products of a tile: fields of `Raw` of the core's shape, those of the right view, ``histogram``."""
         rows = {name: arrays[name] for name in arrays if not name.startswith("right_")}
         histogram = rows.pop("histogram")
         if "right_cost" in arrays:

@@ -10,13 +10,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sat_intervals.config import Config, load_config, named_files, read_yaml
+from sat_intervals.config import load_config, named_files, read_yaml
 from sat_intervals.config.pairs import REPORT, PairOfBatch
 from sat_intervals.config.presets import merged
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.dsm import check_sensors
-from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, OutputError, files_of, open_image
 from sat_intervals.raster.identity import check_not_replaced
@@ -25,13 +24,7 @@ from sat_intervals.run.assemble import end_tiles
 from sat_intervals.run.connection import Connection
 from sat_intervals.run.each import EachOnWorkers
 from sat_intervals.run.job import Job, open_job
-from sat_intervals.run.pair import (
-    Matched,
-    check_failures,
-    complete_before,
-    match_and_assemble,
-    match_jobs,
-)
+from sat_intervals.run.pair import Matched, check_failures, compile_for, complete_before, match_and_assemble, match_jobs
 from sat_intervals.run.state import OUTPUTS
 from sat_intervals.run.status import read_report
 from sat_intervals.run.workers import Workers
@@ -68,8 +61,7 @@ def match_batch(
     surfaces = _Surfaces(pairs, out, on_rectified, overwrite=overwrite, progress=progress)
     _raise_file_limit()
     with locked(out), ExitStack() as stack:
-        report = _Report(out)
-        report.note({pair.name: {"state": "waiting"} for pair in pairs})
+        report = _Report(out, pairs)
         with Connection(common.cluster, out) as connection:
             each = EachOnWorkers(connection, progress)
             jobs: dict[str, Job] = {}
@@ -79,7 +71,8 @@ def match_batch(
                     images = surfaces.epipolar(pair, _opened(pair))
                     own = merged(overrides or {}, pair.settings)
                     settings = load_config(sections, own, preset_wins=True, file=file)
-                    job = _job(pair, images, out, settings, overwrite=overwrite, each=each)
+                    how: dict[str, Any] = {"overwrite": overwrite, "pair": pair.name, "each": each}
+                    job = open_job(*images, out / pair.name, settings, window=_window(pair), **how)
                     stack.enter_context(locked(job.out))
                     if job.begin():
                         jobs[pair.name] = job
@@ -88,8 +81,8 @@ def match_batch(
                 except Exception as error:  # one pair's failure must not stop the others
                     report.note({pair.name: _failed(error)})
             progress("pairs", len(pairs), len(pairs))
-            for name, how in _matched(jobs, connection, progress, keep_tiles=keep_tiles):
-                report.note({name: how})
+            for name, state in _matched(jobs, connection, progress, keep_tiles=keep_tiles):
+                report.note({name: state})
         for pair in pairs:
             state = report.states[pair.name]
             if pair.resolution and state["state"] != "failed":
@@ -100,10 +93,11 @@ def match_batch(
 class _Report:
     """The states of the pairs, here and in ``batch.json``; one that is not of a batch is refused."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, pairs: Sequence[PairOfBatch]) -> None:
         self.states: dict[str, dict[str, Any]] = {}
         self._file = folder / REPORT
         read_report(folder)
+        self.note({pair.name: {"state": "waiting"} for pair in pairs})
 
     def note(self, states: Mapping[str, dict[str, Any]]) -> None:
         """Add states and write the file."""
@@ -132,14 +126,6 @@ def _files(name: str) -> list[str]:
     with suppress(OSError, SatIntervalsError):  # no raster, or its pair will fail
         return files_of(name)
     return [name]
-
-
-def _job(
-    pair: PairOfBatch, images: tuple[Image, Image], out: Path, settings: Config, *, overwrite: bool, each: EachOnWorkers
-) -> Job:
-    return open_job(
-        *images, out / pair.name, settings, window=_window(pair), overwrite=overwrite, pair=pair.name, each=each
-    )
 
 
 class _Surfaces:
@@ -190,9 +176,8 @@ def _cells(pair: PairOfBatch) -> dict[str, Any]:
 
 def _opened(pair: PairOfBatch) -> tuple[Image, Image]:
     def opened(side: str, path: str, mask: str | None) -> Image:
-        options: dict[str, Any] = {
-            name: pair.reading.get(f"{side}_{name}", pair.reading.get(name)) for name in ("band", "nodata")
-        }
+        names = "band", "nodata"
+        options: dict[str, Any] = {one: pair.reading.get(f"{side}_{one}", pair.reading.get(one)) for one in names}
         return open_image(path, **options, mask=mask)
 
     return opened("left", pair.left, pair.left_mask), opened("right", pair.right, pair.right_mask)
@@ -227,7 +212,7 @@ def _matched(
     if not jobs:
         return
     for job in jobs.values():
-        compile_kernels(job.config)
+        compile_for(job)
     assembling: dict[Future[dict[str, Any]], str] = {}
     with _thread() as (thread, check):
         names = {id(job): name for name, job in jobs.items()}

@@ -7,8 +7,8 @@ from typing import Any
 from sat_intervals.heights.rectify import RawPair, make_pair
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, open_image
+from sat_intervals.run.preparing import compared_rows
 from sat_intervals.run.quality import doubts_of_images
-from sat_intervals.run.row_warnings import compared_rows
 
 
 def rectify(

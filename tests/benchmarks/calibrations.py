@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.cli.calibrate import write_calibration
 from sat_intervals.cli.tables import show_calibration
 from sat_intervals.config import PRESETS, key_of, load_config
 from sat_intervals.match.mccnn import MccnnCost
@@ -29,6 +28,7 @@ from sat_intervals.raster import open_image
 from sat_intervals.run.calibrate import calibration_from
 from sat_intervals.run.measure import CalibrationScene, measure_scenes, truth_of
 from sat_intervals.tiling import View
+from sat_intervals.workflows.calibrate import write_calibration
 
 DATA = Path(os.environ.get("SAT_INTERVALS_SHARED", "../shared")) / "data"
 ROOT = Path(__file__).parents[2]

@@ -5,7 +5,6 @@ import os
 import shlex
 import subprocess
 
-import click
 import pytest
 from helpers import COMMAND, invoke, write_pair
 
@@ -92,9 +91,3 @@ def test_completion__knows_commands_and_options():
         given = {"_SAT_INTERVALS_COMPLETE": "bash_complete", "COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
         done = subprocess.run([COMMAND], env=os.environ | given, capture_output=True, text=True, check=True)
         assert done.stdout == expected
-
-
-def test_commands__have_a_help_for_every_option():
-    for name, command in main.commands.items():
-        for option in command.params:
-            assert not isinstance(option, click.Option) or option.help, (name, option.name)

@@ -10,7 +10,6 @@ import rasterio
 from helpers import COMMAND
 
 from sat_intervals import SatIntervalsError, load_config, match_arrays, open_image
-from sat_intervals.cli import app
 from sat_intervals.config.pairs import read_batch
 from sat_intervals.evaluate.surface_accuracy import evaluate_surface
 from sat_intervals.products import SURFACE
@@ -30,13 +29,6 @@ def write(path, bands, crs="EPSG:32631", tags=None, **options):
         if len(bands) == len(SURFACE):
             file.descriptions = [band.name for band in SURFACE]
     return path
-
-
-@pytest.mark.parametrize("error", [MemoryError("no array"), OSError(12, "Cannot allocate memory")])
-def test_explained__a_failed_allocation_is_a_lack_of_memory(error):
-    status, line = app._explained(error)
-    assert status == 1
-    assert "not enough memory: choose a smaller --tile-size or fewer --workers" in line
 
 
 @pytest.mark.process

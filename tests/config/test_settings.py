@@ -260,7 +260,7 @@ REFUSED = [
     ("preset", "papr", "preset is 'papr', allowed: satellite or satellite-mccnn or paper or mccnn"),
     ("preset", ["paper"], "preset is ['paper'], allowed: satellite or"),
     ("sgm", {"p2": 40, "span": 9}, "sgm.span is given, but with cost.method census it follows from p2: leave it out"),
-    (7, {}, "unknown key '7' (known: preset, disparity, rows, cost, sgm"),
+    (7, {}, "unknown key '7' (known: preset, disparity, rows, interval, cost"),
 ]
 
 

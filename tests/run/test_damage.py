@@ -54,20 +54,6 @@ def matched(scene, out, **options):
     assert hashes(out) == hashes(folder / "whole")
 
 
-class StoppedError(Exception):
-    """As a kill between two steps."""
-
-
-def stopped_at(stage):
-    """A callback of progress that stops a run in a stage, once something is done there."""
-
-    def progress(now, done, total):
-        if now == stage and (done or stage != "tiles"):
-            raise StoppedError
-
-    return progress
-
-
 def damage(file, how):
     content = file.read_bytes()
     file.unlink()
@@ -100,12 +86,3 @@ def test_match_pair__makes_a_damaged_file_of_each_kind_again(scene, tmp_path, na
 @pytest.mark.parametrize(("name", "stage"), OF_NETWORK.items())
 def test_match_pair__makes_damaged_files_of_networks_again(scene_of_network, tmp_path, name, stage, how):
     matched_with_damage(scene_of_network, tmp_path / "out", name, stage, how)
-
-
-@pytest.mark.parametrize(("stage", "kind"), [("tiles", BORDERS), ("bands", TILES), ("files", PARTS)])
-def test_match_pair__resumes_where_all_files_of_a_kind_are_damaged(scene, tmp_path, stage, kind):
-    with pytest.raises(StoppedError):
-        matched(scene, tmp_path / "out", progress=stopped_at(stage))
-    for file in (tmp_path / "out" / "tiles" / kind).iterdir():
-        damage(file, "one bit")
-    matched(scene, tmp_path / "out")

@@ -1,7 +1,6 @@
 """Whole runs on real workers: tiles against the whole image, resuming, reports."""
 
 import logging
-import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -66,27 +65,6 @@ def test_match_pair__warns_of_images_without_texture(pair, tmp_path, caplog):
     assert counts["ambiguous"] == ((lower == -4) & (upper == 4)).sum() > counts["valid"] / 2
     (record,) = [record for record in caplog.records if record.levelno >= logging.WARNING]
     assert f"left.tif: the interval of {counts['ambiguous']} of {counts['valid']} valid pixels" in record.getMessage()
-
-
-def test_match_pair__warns_of_undeclared_no_data(tmp_path, caplog):
-    settings = write_pair(tmp_path, make_scene(120, 200, seed=3))
-    for name in ("left", "right"):
-        with rasterio.open(tmp_path / f"{name}.tif", "r+") as file:
-            pixels = file.read(1)
-            pixels[:, :40] = 0
-            file.write(pixels, 1)
-            file.nodata = None
-    counts = match_pair(tmp_path / "left.tif", tmp_path / "right.tif", tmp_path / "out", settings)["counts"]
-    assert 0.1 < counts["ambiguous"] / counts["valid"] < 0.5
-    assert "if it is no data, give --nodata 0" in caplog.text
-
-
-def test_match_pair__warns_of_a_wrong_search_range(pair, tmp_path, caplog):
-    left, right, _ = pair
-    wrong = {"disparity": {"minimum": 50, "maximum": 90}, "sgm": {"p1": 24, "p2": 144}}
-    counts = match_pair(left, right, tmp_path / "out", wrong, window=Window(0, 0, 100, 60))["counts"]
-    assert counts["ambiguous"] < 0.3 * counts["valid"]
-    assert "the ends of the search range: try --disparity" in caplog.text
 
 
 @pytest.mark.parametrize("more", [{}, {"cross_check": {"method": "accurate"}}])
@@ -163,17 +141,6 @@ def test_digest__tells_what_differences_tell(tmp_path):
     assert line.startswith("calibration was null, now {")
     assert line.endswith("...")
     assert len(line) < 150
-
-
-def test_match_pair__says_which_image_is_empty(pair, tmp_path):
-    left, _, settings = pair
-    empty = tmp_path / "empty.tif"
-    shutil.copy(left, empty)
-    with rasterio.open(empty, "r+") as file:
-        file.write(np.zeros(file.shape, "uint16"), 1)
-    with pytest.raises(SatIntervalsError, match=r"empty\.tif are no data"):
-        match_pair(left, empty, tmp_path / "out", settings)
-    assert not list((tmp_path / "out").glob("[a-z]*.*"))
 
 
 class _Matcher:

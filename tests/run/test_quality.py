@@ -1,6 +1,5 @@
 """What is odd about a pair: each cause is named once, the likeliest first."""
 
-import json
 import re
 
 import numpy as np
@@ -152,15 +151,3 @@ def test_verdict_of__compares_widths_with_those_of_the_calibration():
     assert verdict_of(few, config, []) == "only 3 % valid, most of the others by mismatch"
     plain = load_config({"interval": {"alpha": 0.9}, "preset": "paper"})
     assert verdict_of(counts, plain, []) == "90 % valid, nothing unusual"
-
-
-def test_batch__has_a_column_of_warnings(scene, tmp_path):
-    for side in ("left", "right"):
-        lows(scene, tmp_path, side)
-    text = f"name,left,right,minimum,maximum\none,left.tif,right.tif,{scene.minimum},{scene.maximum}\n"
-    (tmp_path / "pairs.csv").write_text(text)
-    result = invoke("batch", tmp_path / "pairs.csv", tmp_path / "out")
-    (row,) = [line.split() for line in result.stdout.splitlines() if line.startswith("one ")]
-    assert row[-1] == "2"
-    assert result.stderr.count("warning: ") == 2
-    assert len(json.loads((tmp_path / "out" / "batch.json").read_text())["one"]["warnings"]) == 2

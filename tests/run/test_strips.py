@@ -2,7 +2,6 @@
 
 import errno
 import shutil
-import signal
 import subprocess
 import tracemalloc
 from dataclasses import replace
@@ -304,16 +303,3 @@ def test_match__goes_on_after_kill_9_in_every_stage_of_its_second_half(tall, tmp
         assert process.wait(60) == 0
     assert hashes(out) == hashes(tall[0] / "kept")
     assert sorted(path.name for path in out.iterdir()) == [LOCK, *OUTPUTS]
-
-
-@pytest.mark.process
-def test_match__survives_kill_9_of_workers_in_its_second_half(tall, tmp_path):
-    out = with_tiles(tall, tmp_path / "out")
-    with Second(tall, out, "--cluster", "processes", "--workers", "2") as process:
-        wait_until(lambda: parts(out) or process.poll() is not None, "a part")
-        for child in psutil.Process(process.pid).children() if process.poll() is None else []:
-            if "spawn_main" in " ".join(child.cmdline()):
-                child.send_signal(signal.SIGKILL)
-                break
-        assert process.wait(60) == 0
-    assert hashes(out) == hashes(tall[0] / "kept")

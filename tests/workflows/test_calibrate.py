@@ -11,8 +11,6 @@ import yaml
 from helpers import PLACE, invoke, write_pair
 
 from sat_intervals import SatIntervalsError, match_pair, open_image
-from sat_intervals.cli.calibrate import _Judging, _scenes
-from sat_intervals.cli.matching import SettingsArguments
 from sat_intervals.config import PRESETS, Cluster, calibration_of, load_calibration, load_config
 from sat_intervals.config.calibration import COVERAGES
 from sat_intervals.demo import make_scene
@@ -22,6 +20,7 @@ from sat_intervals.raster import write_layer
 from sat_intervals.run.calibrate import check_scenes
 from sat_intervals.run.job import open_job
 from sat_intervals.run.measure import CalibrationScene, measure_scenes, truth_of
+from sat_intervals.workflows.calibrate import Choices, scenes_of
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +158,7 @@ def test_calibrate__mistaken_arguments_are_one_line(scene, tmp_path):
 
 
 def test_measure_scenes__deletes_the_tiles_of_a_killed_calibration(scene, tmp_path):
-    scenes = _scenes((scene,), (), _Judging(SettingsArguments(None, {}), 0.0, False, False))
+    scenes = scenes_of([scene], (), Choices())
     left = tmp_path / "left"
 
     def keep(stage, done, total):
@@ -175,7 +174,7 @@ def test_measure_scenes__deletes_the_tiles_of_a_killed_calibration(scene, tmp_pa
 
 def test_measure_scenes__ends_where_an_image_changes(scene, tmp_path):
     pair = copytree(scene, tmp_path / "pair")
-    scenes = _scenes((pair,), (), _Judging(SettingsArguments(None, {}), 0.0, False, False))
+    scenes = scenes_of([pair], (), Choices())
 
     def change(stage, done, total):
         if stage == "tiles":
@@ -193,14 +192,6 @@ def off(folder):
     return file
 
 
-def test_calibrate__a_calibration_of_other_settings_is_refused(scene, tmp_path):
-    arguments = "match", scene / "left.tif", scene / "right.tif", tmp_path / "out", "--disparity", -10, 10
-    with_calibration = "--coverage", 0.9, "--calibration", scene / "calibration.yaml"
-    line = one_line(invoke(*arguments, *with_calibration, "--preset", "paper"))
-    assert "belongs to other settings" in line
-    assert "sat-intervals calibrate" in line
-
-
 def test_calibrate__a_run_with_local_ranges_is_matched_over_its_whole_range(scene, tmp_path):
     settings = settings_with(scene)
     settings["disparity"]["local"] = True
@@ -214,16 +205,6 @@ def test_check_scenes__needs_the_search_range_as_numbers(scene):
     scene = CalibrationScene("one", "one", left, right, truth_of(left, scene / "truth.tif"), load_config({}))
     with pytest.raises(SatIntervalsError, match="one: the search range is auto, but calibrate needs it as numbers"):
         check_scenes([scene])
-
-
-def test_calibrate__levels_out_of_order_are_refused(scene, tmp_path):
-    content = yaml.safe_load((scene / "calibration.yaml").read_text())
-    content["levels"][3]["high"] = 1e-3
-    (tmp_path / "edited.yaml").write_text(yaml.safe_dump(content))
-    arguments = "match", scene / "left.tif", scene / "right.tif", tmp_path / "out", "--disparity", -10, 10
-    line = one_line(invoke(*arguments, "--coverage", 0.9, "--calibration", tmp_path / "edited.yaml"))
-    assert "edited.yaml" in line
-    assert "high falls" in line
 
 
 def test_match__warns_of_a_coverage_that_the_calibration_does_not_reach(scene, tmp_path):
@@ -258,7 +239,7 @@ def test_calibrate__a_run_is_matched_again_on_this_machine(scene, tmp_path):
     settings = settings_with(scene) | {"cluster": {"workers": 2, "store": str(tmp_path / "store")}}
     match_pair(scene / "left.tif", scene / "right.tif", tmp_path / "out", settings)
     for given in ({}, {"cluster": {"workers": 1}}):
-        (scene,) = _scenes((tmp_path / "out",), (), _Judging(SettingsArguments(None, given), 0.0, False, False))
+        (scene,) = scenes_of([tmp_path / "out"], (), Choices(overrides=given))
         assert scene.config.cluster == Cluster(**given.get("cluster", {}))
 
 
@@ -285,7 +266,7 @@ def test_check_scenes__refuses_a_scene_that_counts_twice(scene, tmp_path):
         match_pair(scene / "left.tif", scene / "right.tif", out, settings_with(scene, coverage=0.9))
     line = one_line(invoke("calibrate", tmp_path / "one", tmp_path / "other", "--output", tmp_path / "new.yaml"))
     assert f"{tmp_path}/one and {tmp_path}/other are the same scene: give each scene once" in line
-    (one,) = _scenes((scene,), (), _Judging(SettingsArguments(None, {}), 0.0, False, False))
+    (one,) = scenes_of([scene], (), Choices())
     third = open_image(copytree(scene, tmp_path / "third") / "right.tif")
     check_scenes([one, dataclasses.replace(one, name="a triplet", group="another", right=third)])
 
