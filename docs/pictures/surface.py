@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sat_intervals.raster import read_layers, read_place
-from sat_intervals.show.canvas import GROUND, Frame, MapLayer, draw_layer, draw_map, map_size, page
+from sat_intervals.show.canvas import GROUND, PlotFrame, MapLayer, draw_layer, draw_map, map_size, page
 from sat_intervals.show.surface_map import _relief
 
 CREDIT = "Pleiades imagery (c) CNES, distribution Airbus DS, published by CNES with Picanteo; Open Licence 2.0 (Etalab)"
@@ -23,7 +23,7 @@ def main(out: Path, target: Path) -> None:
     assert place.transform is not None
     cell = place.transform.a
     left, top = place.transform.c, place.transform.f
-    frame = Frame(left, left + shape[1] * cell, top - shape[0] * cell, top, GROUND)
+    frame = PlotFrame(left, left + shape[1] * cell, top - shape[0] * cell, top, GROUND)
     rows, columns = map_size(shape, 5.0)
     halves = (upper - lower) / 2
     with page(target, (2 * columns + 2.0, rows + 1.0), 90, CREDIT) as figure:
