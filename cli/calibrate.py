@@ -6,35 +6,26 @@ from typing import Any
 
 import click
 
+from sat_intervals.cli import options
 from sat_intervals.cli.calibrate_dsm import calibrate_heights
 from sat_intervals.cli.matching import SettingsArguments, settings_options
-from sat_intervals.cli.options import (
-    FILE,
-    Grouped,
-    Printing,
-    Surface,
-    overwrite_option,
-    printing_options,
-    surface_options,
-    tolerance_option,
-)
 
 
-@click.command(cls=Grouped, short_help="Find the levels that reach a coverage, on pairs with known truth.")
-@click.argument("pairs", nargs=-1, type=FILE)
-@click.option("--output", type=FILE, required=True, help="Calibration to write (YAML).")
-@overwrite_option
+@click.command(cls=options.Grouped, short_help="Find the levels that reach a coverage, on pairs with known truth.")
+@click.argument("pairs", nargs=-1, type=options.FILE)
+@click.option("--output", type=options.FILE, required=True, help="Calibration to write (YAML).")
+@options.overwrite_option
 @click.option(
-    "--truth", "truths", type=FILE, multiple=True, help="True disparity; one for each of PAIRS, in that order."
+    "--truth", "truths", type=options.FILE, multiple=True, help="True disparity; one for each of PAIRS, in that order."
 )
-@tolerance_option
+@options.tolerance_option
 @click.option("--remove-bias", is_flag=True, help="Add the median of disparity - truth of each pair to its truth.")
 @click.option(
     "--by-group", is_flag=True, help="Leave out all pairs of a group together (meta.json, CSV), not each pair."
 )
 @click.option("--name", help="Name of the calibration; by default that of the file.")
-@surface_options("Calibrate this surface model against --reference, instead of pairs.", "pairs", "coverage")
-@printing_options
+@options.surface_options("Calibrate this surface model against --reference, instead of pairs.", "pairs", "coverage")
+@options.printing_options
 @click.option(
     "--coverage",
     type=float,
@@ -47,10 +38,10 @@ def calibrate(
     output: Path,
     overwrite: bool,
     name: str | None,
-    surface: Surface | None,
+    surface: options.Surface | None,
     coverage: float | None,
     settings: SettingsArguments,
-    printing: Printing,
+    printing: options.Printing,
     **how: Any,
 ) -> None:
     """Find the levels of the cost curve whose intervals reach coverages of .5 to .99 on PAIRS, and write them to FILE.

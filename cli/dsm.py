@@ -7,21 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from sat_intervals.cli import options
 from sat_intervals.cli.logs import warn
-from sat_intervals.cli.options import (
-    FILE,
-    Command,
-    Grouped,
-    Printing,
-    SensorFiles,
-    expert_option,
-    note_geometry,
-    output_file,
-    overwrite_option,
-    printing_options,
-    sensor_options,
-    with_options,
-)
 from sat_intervals.cli.triangulate import say_geometry
 
 if TYPE_CHECKING:
@@ -29,41 +16,45 @@ if TYPE_CHECKING:
 
 _CELL_OPTIONS = (
     click.option("--resolution", type=float, metavar="METRES", help="Side of a cell; or give --grid-like."),
-    click.option("--grid-like", type=FILE, help="North-up raster whose grid and CRS the surface takes."),
+    click.option("--grid-like", type=options.FILE, help="North-up raster whose grid and CRS the surface takes."),
     click.option("--crs", metavar="EPSG", help="A projected CRS in metres; default the UTM zone of the points."),
-    expert_option("--radius", type=float, metavar="METRES", help="Reach of a point; default the side of a cell."),
-    click.option("--geoid", type=FILE, help="Geoid grid (GTX, GeoTIFF) that heights refer to."),
-    expert_option(
+    options.expert_option(
+        "--radius", type=float, metavar="METRES", help="Reach of a point; default the side of a cell."
+    ),
+    click.option("--geoid", type=options.FILE, help="Geoid grid (GTX, GeoTIFF) that heights refer to."),
+    options.expert_option(
         "--bounds",
         type=click.Choice(("envelope", "median")),
         help="Interval of a cell: medians of its points' bounds (default for runs with a coverage), or the envelope of "
         "their intervals (default for others).",
     ),
-    expert_option(
+    options.expert_option(
         "--keep-border",
         "keeps_border",
         is_flag=True,
         help="Keep points of confidence below 0.1 beside missing data of the right image.",
     ),
-    expert_option(
+    options.expert_option(
         "--keep-open/--drop-open",
         "keeps_open",
         default=None,
         help="Keep or leave out points whose interval is open at an end of the search range; default: leave out with a "
         "coverage, else keep.",
     ),
-    expert_option(
+    options.expert_option(
         "--outliers",
         type=float,
         metavar="METRES",
         help="Leave out points farther than this from the median height within 2 pixels; default: none.",
     ),
-    expert_option("--max-width", type=float, metavar="METRES", help="Leave out cells with a wider interval."),
-    expert_option("--min-confidence", type=float, metavar="C", help="Leave out cells of lower confidence, 0 to 1."),
+    options.expert_option("--max-width", type=float, metavar="METRES", help="Leave out cells with a wider interval."),
+    options.expert_option(
+        "--min-confidence", type=float, metavar="C", help="Leave out cells of lower confidence, 0 to 1."
+    ),
 )
 
 
-def cell_options(command: Command) -> Command:
+def cell_options(command: options.Command) -> options.Command:
     """Add options for the cells of a surface, beside a `calibration_option`: ``cells``, arguments of `make_surface`."""
 
     @wraps(command)
@@ -82,15 +73,15 @@ def cell_options(command: Command) -> Command:
         cells |= {"resolution": like or cells["resolution"], "choices": SurfaceChoices(**choices)}
         return command(cells=cells, **given)
 
-    return with_options(with_cells, *_CELL_OPTIONS)
+    return options.with_options(with_cells, *_CELL_OPTIONS)
 
 
-def calibration_option(*names: str) -> Callable[[Command], Command]:
+def calibration_option(*names: str) -> Callable[[options.Command], options.Command]:
     """Return an option for the calibration that `cell_options` reads."""
     return click.option(
         *names,
         "height_calibration",
-        type=FILE,
+        type=options.FILE,
         help="Calibration written by calibrate --dsm: margins in metres that move the bounds.",
     )
 
@@ -126,21 +117,21 @@ def say_surface(console: "Console", report: dict[str, Any]) -> None:
     )
 
 
-@click.command(cls=Grouped, short_help="Make a surface model with height intervals from one or several runs.")
-@click.argument("outs", metavar="OUT...", nargs=-1, required=True, type=FILE)
+@click.command(cls=options.Grouped, short_help="Make a surface model with height intervals from one or several runs.")
+@click.argument("outs", metavar="OUT...", nargs=-1, required=True, type=options.FILE)
 @cell_options
 @calibration_option("--calibration")
-@click.option("--output", type=FILE, help="File to write; default dsm.tif in the first OUT.")
-@overwrite_option
-@sensor_options
-@printing_options
+@click.option("--output", type=options.FILE, help="File to write; default dsm.tif in the first OUT.")
+@options.overwrite_option
+@options.sensor_options
+@options.printing_options
 def dsm(
     outs: tuple[Path, ...],
     cells: dict[str, Any],
     output: Path | None,
     overwrite: bool,
-    sensor_files: list[SensorFiles],
-    printing: Printing,
+    sensor_files: list[options.SensorFiles],
+    printing: options.Printing,
 ) -> None:
     """Make a surface model from the finished runs in the folders OUT.
 
@@ -159,9 +150,9 @@ def dsm(
     """
     from sat_intervals.heights.dsm import make_surface
 
-    output = output_file(output, outs[0] / "dsm.tif", overwrite=overwrite)
+    output = options.output_file(output, outs[0] / "dsm.tif", overwrite=overwrite)
     with printing.console() as console:
-        note_geometry(outs, sensor_files)
+        options.note_geometry(outs, sensor_files)
         report = make_surface(outs, output, **cells, progress=console.progress)
     printing.say(report)
     say_surface(console, report)

@@ -5,18 +5,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from sat_intervals.cli import options
 from sat_intervals.cli.logs import warn
 from sat_intervals.cli.matching import PairArguments, image_options
-from sat_intervals.cli.options import (
-    FILE,
-    Command,
-    Grouped,
-    Printing,
-    expert_option,
-    gathered,
-    overwrite_option,
-    printing_options,
-)
 
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
@@ -26,19 +17,19 @@ def _raw(*, dem: Path | None, altitude: float | None, resolution_of: str | None)
     return {"dem": dem, "altitude": altitude, "resolution_of": resolution_of}
 
 
-def raw_options(command: Command) -> Command:
+def raw_options(command: options.Command) -> options.Command:
     """Add options for the grids of a raw pair; the command gets ``raw``, their values."""
-    return gathered(
+    return options.gathered(
         "raw",
         _raw,
-        click.option("--dem", type=FILE, help="Raw images: DEM whose heights have disparity 0."),
-        expert_option(
+        click.option("--dem", type=options.FILE, help="Raw images: DEM whose heights have disparity 0."),
+        options.expert_option(
             "--altitude",
             type=float,
             metavar="METRES",
             help="Raw images: height above the ellipsoid that has disparity 0; default the middle of the ground's.",
         ),
-        expert_option(
+        options.expert_option(
             "--resolution-of",
             type=click.Choice(("coarser", "left")),
             help="Raw images: whose pixel size to take if they differ by more than 10 %; default coarser.",
@@ -46,16 +37,16 @@ def raw_options(command: Command) -> Command:
     )(command)
 
 
-@click.command(cls=Grouped, short_help="Make an epipolar pair of two raw images.")
+@click.command(cls=options.Grouped, short_help="Make an epipolar pair of two raw images.")
 @image_options
-@click.argument("out", type=FILE)
-@click.option("--left-model", type=FILE, help="RPC model of the left image; default that in or beside it.")
-@click.option("--right-model", type=FILE, help="RPC model of the right image.")
+@click.argument("out", type=options.FILE)
+@click.option("--left-model", type=options.FILE, help="RPC model of the left image; default that in or beside it.")
+@click.option("--right-model", type=options.FILE, help="RPC model of the right image.")
 @raw_options
-@click.option("--geoid", type=FILE, help="Geoid grid that heights of --dem refer to; default the ellipsoid.")
-@overwrite_option
-@printing_options
-def rectify(pair: PairArguments, out: Path, raw: dict[str, Any], printing: Printing, **more: Any) -> None:
+@click.option("--geoid", type=options.FILE, help="Geoid grid that heights of --dem refer to; default the ellipsoid.")
+@options.overwrite_option
+@options.printing_options
+def rectify(pair: PairArguments, out: Path, raw: dict[str, Any], printing: options.Printing, **more: Any) -> None:
     """Resample the raw images LEFT and RIGHT, with RPC models, to an epipolar pair in the folder OUT.
 
     \b

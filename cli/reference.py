@@ -5,18 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from sat_intervals.cli import options
 from sat_intervals.cli.logs import warn
-from sat_intervals.cli.options import (
-    FILE,
-    Grouped,
-    Printing,
-    SensorFiles,
-    note_geometry,
-    output_file,
-    overwrite_option,
-    printing_options,
-    sensor_options,
-)
 
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
@@ -25,18 +15,18 @@ if TYPE_CHECKING:
 _SUSPECT_ROWS = 0.5
 
 
-@click.command(cls=Grouped, short_help="Turn reference heights into true disparities of a run.")
-@click.argument("out", type=FILE)
-@click.option("--heights", type=FILE, help="Raster of heights, in any CRS.")
-@click.option("--points", type=FILE, help="Points: CSV, Parquet, LAS, LAZ, GeoPackage.")
+@click.command(cls=options.Grouped, short_help="Turn reference heights into true disparities of a run.")
+@click.argument("out", type=options.FILE)
+@click.option("--heights", type=options.FILE, help="Raster of heights, in any CRS.")
+@click.option("--points", type=options.FILE, help="Points: CSV, Parquet, LAS, LAZ, GeoPackage.")
 @click.option("--ellipsoid", is_flag=True, help="Heights are above the ellipsoid of WGS 84.")
-@click.option("--geoid", type=FILE, help="Geoid grid (GTX, GeoTIFF) that heights refer to.")
+@click.option("--geoid", type=options.FILE, help="Geoid grid (GTX, GeoTIFF) that heights refer to.")
 @click.option("--crs", metavar="EPSG", help="CRS of the heights, in place of the file's.")
 @click.option("--no-register", is_flag=True, help="Do not move the reference to the heights of the run.")
-@click.option("--output", type=FILE, help="File to write; default truth.tif in OUT.")
-@overwrite_option
-@sensor_options
-@printing_options
+@click.option("--output", type=options.FILE, help="File to write; default truth.tif in OUT.")
+@options.overwrite_option
+@options.sensor_options
+@options.printing_options
 def reference(
     out: Path,
     heights: Path | None,
@@ -47,8 +37,8 @@ def reference(
     no_register: bool,
     output: Path | None,
     overwrite: bool,
-    sensor_files: list[SensorFiles],
-    printing: Printing,
+    sensor_files: list[options.SensorFiles],
+    printing: options.Printing,
 ) -> None:
     """Write the disparities that reference heights have in the finished run OUT: OUT/truth.tif.
 
@@ -69,11 +59,11 @@ def reference(
     from sat_intervals.heights.reference import Reference, make_truth
     from sat_intervals.raster import Vertical
 
-    target = output_file(output, out / "truth.tif", overwrite=overwrite)
+    target = options.output_file(output, out / "truth.tif", overwrite=overwrite)
     vertical = Vertical(ellipsoid, geoid)
     given = Reference(heights or points, points is not None, vertical, crs)  # type: ignore[arg-type]
     with printing.console() as console:
-        note_geometry([out], sensor_files)
+        options.note_geometry([out], sensor_files)
         report = make_truth(out, given, path=output, registers=not no_register, progress=console.progress)
     _say_fit(console, out, given.path, report)
     console.say(

@@ -5,31 +5,21 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from sat_intervals.cli import options
 from sat_intervals.cli.logs import warn
-from sat_intervals.cli.options import (
-    FILE,
-    Grouped,
-    Printing,
-    SensorFiles,
-    note_geometry,
-    output_file,
-    overwrite_option,
-    printing_options,
-    sensor_options,
-)
 
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
 
 
-@click.command(cls=Grouped, short_help="Export the points of a run with height bounds.")
-@click.argument("out", type=FILE)
-@click.option("--output", type=FILE, help="File to write: .tif, .laz or .las; default points.tif in OUT.")
-@overwrite_option
-@sensor_options
-@printing_options
+@click.command(cls=options.Grouped, short_help="Export the points of a run with height bounds.")
+@click.argument("out", type=options.FILE)
+@click.option("--output", type=options.FILE, help="File to write: .tif, .laz or .las; default points.tif in OUT.")
+@options.overwrite_option
+@options.sensor_options
+@options.printing_options
 def triangulate(
-    out: Path, output: Path | None, overwrite: bool, sensor_files: list[SensorFiles], printing: Printing
+    out: Path, output: Path | None, overwrite: bool, sensor_files: list[options.SensorFiles], printing: options.Printing
 ) -> None:
     """Write the points of the finished run in the folder OUT; `dsm` does not need them.
 
@@ -44,9 +34,9 @@ def triangulate(
     """  # noqa: D301 (\b keeps the line breaks in click)
     from sat_intervals.heights.triangulate import triangulate
 
-    output = output_file(output, out / "points.tif", overwrite=overwrite)
+    output = options.output_file(output, out / "points.tif", overwrite=overwrite)
     with printing.console() as console:
-        note_geometry([out], sensor_files)
+        options.note_geometry([out], sensor_files)
         report = triangulate(out, output, console.progress)
     printing.say(report)
     if report["points"]:

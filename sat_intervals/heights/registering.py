@@ -7,17 +7,8 @@ import numpy as np
 from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.lattice import Extent, Lattice
 from sat_intervals.heights.point_cloud import Cells, PointCloud
+from sat_intervals.kernels import registration
 from sat_intervals.kernels.gridding import mean_heights
-from sat_intervals.kernels.registration import (
-    ACROSS,
-    POINTS,
-    REACH,
-    Blocks,
-    block_side,
-    every_nth,
-    put_together,
-    spread_blocks,
-)
 from sat_intervals.kernels.relief import sampled
 from sat_intervals.raster import HeightRaster, Projection
 from sat_intervals.results import Run
@@ -28,38 +19,38 @@ _SMALLEST = 24  # smallest side of a block in pixels
 
 def blocks_of_raster(
     run: Run, lattice: Lattice, raster: HeightRaster, projection: Projection, pixel: float
-) -> Blocks | None:
+) -> registration.Blocks | None:
     """Return points of a run on surfaces of a raster, None if nothing is common; ``pixel`` is metres on the ground."""
     cell = max(pixel, raster.cell)
     parts = []
-    for window in spread_blocks(Window(0, 0, *run.shape), _SMALLEST):
+    for window in registration.spread_blocks(Window(0, 0, *run.shape), _SMALLEST):
         points = lattice.points(window, run.read_bands(window).matched)
         points = points[:, np.isfinite(points[2])]
         if points.size:
-            x, y, height = points[:, every_nth(points.shape[1])]
+            x, y, height = points[:, registration.every_nth(points.shape[1])]
             cells = _around(x, y, cell)
             parts.append((_on_cells(raster, projection, cells), *_in_cells(cells, x, y), height))
-    return put_together(parts, cell, moves=1)
+    return registration.put_together(parts, cell, moves=1)
 
 
-def blocks_of_points(run: Run, lattice: Lattice, places: np.ndarray, pixel: float) -> Blocks | None:
+def blocks_of_points(run: Run, lattice: Lattice, places: np.ndarray, pixel: float) -> registration.Blocks | None:
     """Return points, ``(n, 3)`` on the map and above the ellipsoid, on surfaces of a run; None without a point."""
     cloud = PointCloud(run, lattice, SurfaceChoices("envelope").for_intervals([run.config.interval]))
-    side = block_side(*run.shape, _SMALLEST) * pixel
+    side = registration.block_side(*run.shape, _SMALLEST) * pixel
     groups, numbers = np.unique(np.floor(places[:, :2] / side), axis=0, return_inverse=True)
     counts = np.bincount(numbers.ravel(), minlength=len(groups))
     parts = []
-    for group in np.argsort(-counts, kind="stable")[: ACROSS**2]:
-        x, y, height = places[numbers.ravel() == group][:POINTS].T
+    for group in np.argsort(-counts, kind="stable")[: registration.ACROSS**2]:
+        x, y, height = places[numbers.ravel() == group][: registration.POINTS].T
         cells = _around(x, y, pixel)
         gathered, _ = cloud.splat(cells, Window(0, 0, cells.rows, cells.columns), pixel, threading.Event())
         parts.append((mean_heights(gathered), *_in_cells(cells, x, y), height))
-    return put_together(parts, pixel, moves=-1)
+    return registration.put_together(parts, pixel, moves=-1)
 
 
 def _around(x: np.ndarray, y: np.ndarray, cell: float) -> Cells:
     """Return cells that cover map places, and a shift of them."""
-    return Cells.over(Extent(x.min(), y.min(), x.max(), y.max()).grown((REACH + 1) * cell), cell)
+    return Cells.over(Extent(x.min(), y.min(), x.max(), y.max()).grown((registration.REACH + 1) * cell), cell)
 
 
 def _in_cells(cells: Cells, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

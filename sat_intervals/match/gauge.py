@@ -7,16 +7,8 @@ import numpy as np
 
 from sat_intervals.config import Calibration, Config, Interval, key_of
 from sat_intervals.config.calibration import COVERAGES
+from sat_intervals.match import postprocess
 from sat_intervals.match.measurement import FIELDS, HIGH, QUANTILES, SCHEMES, Measured, ThresholdSweep, measure
-from sat_intervals.match.postprocess import (
-    ConfidenceScale,
-    Filtered,
-    RawRows,
-    cut_rows,
-    filter_rows,
-    regularized,
-    widened,
-)
 from sat_intervals.match.refinement import bounds_of_both
 from sat_intervals.products import INVALID
 
@@ -64,9 +56,9 @@ class Gauge:
 
     def add(
         self,
-        strip: RawRows,
+        strip: postprocess.RawRows,
         inner: slice,
-        scale: ConfidenceScale,
+        scale: postprocess.ConfidenceScale,
         truth: tuple[np.ndarray, np.ndarray],
         pair: tuple[int, int],
         config: Config,
@@ -78,18 +70,18 @@ class Gauge:
         cuts = (strip.lower, strip.upper), (strip.lower_low, strip.upper_low)
         for threshold, (lower, upper) in zip(dict.fromkeys(pair), cuts, strict=False):
             one_cut = strip._replace(lower=lower, upper=upper, lower_low=lower, upper_low=upper)
-            rows = filter_rows(one_cut, scale, config)
-            here = cut_rows(rows, inner.start, inner.stop)
+            rows = postprocess.filter_rows(one_cut, scale, config)
+            here = postprocess.cut_rows(rows, inner.start, inner.stop)
             valid = (here.validity & INVALID == 0) & np.isfinite(truth[0])
             for number, scheme, bounds in self._bounds(rows, inner, threshold, config):
                 chosen = np.flatnonzero(valid & (here.low == (scheme != HIGH)))
                 middle, low, high, true, part = (band.ravel()[chosen] for band in (here.disparity, *bounds, *truth))
-                low, high = widened(low, high, middle, config)
+                low, high = postprocess.widened(low, high, middle, config)
                 measured = measure(low, high, true, self._tolerance, part, len(self._tables))
                 self._tables[:, number, scheme] += measured
 
     def _bounds(
-        self, rows: Filtered, inner: slice, threshold: int, config: Config
+        self, rows: postprocess.Filtered, inner: slice, threshold: int, config: Config
     ) -> Iterator[tuple[int, int, tuple[np.ndarray, np.ndarray]]]:
         """Yield the thresholds and schemes that the rows ``inner`` are measured for, and their bounds."""
         if threshold == OF_FITS:
@@ -99,4 +91,4 @@ class Gauge:
             return
         for scheme, quantile in enumerate((None, *QUANTILES)):
             if scheme != HIGH or self._thresholds.are_one:
-                yield threshold, scheme, regularized(rows, inner.start, inner.stop, config, quantile)
+                yield threshold, scheme, postprocess.regularized(rows, inner.start, inner.stop, config, quantile)

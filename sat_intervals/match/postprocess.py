@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from sat_intervals import products
 from sat_intervals.config import Ambiguity, Config
 from sat_intervals.kernels.confidence import low_confidence, normalize
 from sat_intervals.kernels.disparity import cross_check, median
@@ -16,17 +17,6 @@ from sat_intervals.kernels.intervals import regularize
 from sat_intervals.kernels.matching import Raw, RightView
 from sat_intervals.match.histogram import quantile
 from sat_intervals.match.refinement import HALO, Refined, bounds_of_both, refined
-from sat_intervals.products import (
-    BOUND_STEPS,
-    INVALID,
-    NO_DISPARITY,
-    NOT_REFINED,
-    OPEN_ABOVE,
-    OPEN_BELOW,
-    RANGE_END,
-    REGULARIZED,
-    Bands,
-)
 
 # Steps per pixel in which sub-pixel bounds are regularised.
 _STEPS = 8
@@ -112,7 +102,7 @@ def halo(config: Config) -> int:
     return radius + max(config.regularization.depth if config.regularization else 0, HALO if config.fits else 0)
 
 
-def postprocess_rows(rows: RawRows, first: int, last: int, scale: ConfidenceScale, config: Config) -> Bands:
+def postprocess_rows(rows: RawRows, first: int, last: int, scale: ConfidenceScale, config: Config) -> products.Bands:
     """Final bands of the rows ``[first, last)``, counted from the first of ``rows``.
 
     ``rows`` has these rows and at least `halo` rows above and below, inside the region.
@@ -125,32 +115,32 @@ def postprocess_rows(rows: RawRows, first: int, last: int, scale: ConfidenceScal
         quantile = cuts.quantile if cuts else config.regularization.quantile
         lower, upper = regularized(filtered, first, last, config, quantile)
         assert low is not None
-        validity[low[inner]] |= REGULARIZED
+        validity[low[inner]] |= products.REGULARIZED
     if config.fits and cuts:
         assert low is not None  # a coverage needs both classes
         fits = filtered.fits(inner)
         bounds = bounds_of_both(fits, filtered.lower[inner], filtered.upper[inner], cuts.high, config)
         lower, upper = (np.where(low[inner], old, new) for new, old in zip(bounds, (lower, upper), strict=True))
     disparity = np.where(filtered.written[inner], filtered.disparity[inner], np.float32(np.nan))
-    bands = Bands(disparity, *widened(lower, upper, disparity, config), filtered.confidence[inner], validity)
+    bands = products.Bands(disparity, *widened(lower, upper, disparity, config), filtered.confidence[inner], validity)
     return bands._replace(sigma=filtered.deviation[inner]) if config.products.sigma else bands
 
 
 def filter_rows(rows: RawRows, scale: ConfidenceScale, config: Config) -> Filtered:
     """Cross-check, confidence and medians: all steps before regularisation; see `postprocess_rows`."""
-    searched = rows.winner != NO_DISPARITY
+    searched = rows.winner != products.NO_DISPARITY
     validity = rows.validity.copy()
     if config.cross_check:
         tolerance = config.cross_check.tolerance
         validity |= cross_check(rows.winner, rows.right_winner, config.disparity.minimum, tolerance)
-    kept = searched & (validity & INVALID == 0)
+    kept = searched & (validity & products.INVALID == 0)
     confidence = normalize(rows.ambiguity, searched, scale.p1, scale.p99)
     if config.opens_ends:  # beyond the ends of the range the true disparity may be
-        ends = validity & RANGE_END != 0
+        ends = validity & products.RANGE_END != 0
         confidence[ends] = 0
         if config.interval:
             below = rows.winner <= config.disparity.minimum + 1
-            validity[ends] |= np.where(below[ends], OPEN_BELOW, OPEN_ABOVE).astype(validity.dtype)
+            validity[ends] |= np.where(below[ends], products.OPEN_BELOW, products.OPEN_ABOVE).astype(validity.dtype)
     low = None
     if config.regularization:
         low = low_confidence(confidence, config.regularization.threshold, config.regularization.kernel)
@@ -160,7 +150,7 @@ def filter_rows(rows: RawRows, scale: ConfidenceScale, config: Config) -> Filter
     deviation = _EMPTY
     if config.fits:
         disparity, deviation = refined(disparity, kept, rows.left, rows.right, config)
-        validity[np.isfinite(deviation)] &= ~np.uint16(NOT_REFINED)
+        validity[np.isfinite(deviation)] &= ~np.uint16(products.NOT_REFINED)
     written = searched if config.products.keep_rejected else kept
     return Filtered(disparity, lower, upper, confidence, validity, low, written, deviation)
 
@@ -172,9 +162,9 @@ def widened(
     lower, upper = np.minimum(lower, disparity), np.maximum(upper, disparity)
     if config.has_coverage:
         for round_, bound in ((np.floor, lower), (np.ceil, upper)):  # in place: half the time
-            bound *= BOUND_STEPS
+            bound *= products.BOUND_STEPS
             round_(bound, out=bound)
-            bound /= BOUND_STEPS
+            bound /= products.BOUND_STEPS
     return lower, upper
 
 
@@ -220,7 +210,7 @@ def regularized(
     return lower, upper
 
 
-def postprocess_strips(strips: Iterable[RawRows], scale: ConfidenceScale, config: Config) -> Iterator[Bands]:
+def postprocess_strips(strips: Iterable[RawRows], scale: ConfidenceScale, config: Config) -> Iterator[products.Bands]:
     """Final bands of a region from its strips, from the top; a row is finished once the halo below it is read."""
     for rows, first, last in with_halo(strips, halo(config)):
         yield postprocess_rows(rows, first, last, scale, config)
@@ -228,7 +218,7 @@ def postprocess_strips(strips: Iterable[RawRows], scale: ConfidenceScale, config
 
 def postprocess_strip(
     pieces: Iterable[RawRows], above: int, height: int, scale: ConfidenceScale, config: Config
-) -> Iterator[Bands]:
+) -> Iterator[products.Bands]:
     """Final bands of a strip of ``height`` rows, the same in every bit as those of the whole region.
 
     ``pieces``, from the top, are the strip with `halo` rows, inside the region, above and below it: ``above`` above.
