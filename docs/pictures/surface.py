@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sat_intervals.raster import read_layers, read_place
-from sat_intervals.show.canvas import GROUND, PlotFrame, MapLayer, draw_layer, draw_map, map_size, page
+from sat_intervals.show.canvas import GROUND, MapLayer, PlotFrame, draw_layer, draw_map, map_size, page
 from sat_intervals.show.surface_map import _relief
 
 CREDIT = "Pleiades imagery (c) CNES, distribution Airbus DS, published by CNES with Picanteo; Open Licence 2.0 (Etalab)"
