@@ -165,10 +165,8 @@ def _flat(key: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def at(calibration: Calibration, coverage: float) -> Levels:
-    """Return the levels of a coverage, linear between those of COVERAGES.
-
-    Where the quantiles of both neighbours differ, low-confidence pixels take level and quantile of the larger one.
-    """
+    """Return the levels of a coverage, linear between those of COVERAGES."""
+    # Where the quantiles of both neighbours differ, low-confidence pixels take level and quantile of the larger one.
     if not COVERAGES[0] <= coverage <= COVERAGES[-1]:
         raise ConfigError(f"coverage is {coverage:g}, allowed: {COVERAGES[0]} to {COVERAGES[-1]}")
     above = bisect_left(COVERAGES, coverage)

@@ -26,10 +26,7 @@ def preset_settings(name: str) -> Mapping[str, Any]:
 
 
 def merged(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings with overrides, which win key by key.
-
-    What belongs to another matching cost, other penalties or another level of intervals than theirs is left out.
-    """
+    """Return settings with overrides, which win key by key; what belongs to other costs or levels is left out."""
     kept = {name: dict(section) if isinstance(section, Mapping) else section for name, section in values.items()}
     overrides = {name: _given_keys(name, section) for name, section in overrides.items()}
 

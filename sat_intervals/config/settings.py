@@ -148,12 +148,10 @@ class Config(sections.Section):
 
     @property
     def cost_span(self) -> int:
-        """Return the cost span of etas and alpha: largest minus smallest possible cost, or the setting ``sgm.span``.
-
-        This is the paper's ``max C_V - min C_V``, declared rather than measured: a span measured on a tile would make
-        the result depend on the tiling. With Census real scenes attain both bounds. With MC-CNN they stay far from
-        them and vary, hence the setting.
-        """
+        """Return the cost span of etas and alpha: largest minus smallest possible cost, or the setting ``sgm.span``."""
+        # This is the paper's ``max C_V - min C_V``, declared rather than measured: a span measured on a tile would make
+        # the result depend on the tiling. With Census real scenes attain both bounds. With MC-CNN they stay far from
+        # them and vary, hence the setting.
         return self.largest_sum if self.sgm is None or self.sgm.span is None else self.in_steps(self.sgm.span)
 
     def _excess(self, share: Fraction) -> Fraction:
@@ -164,10 +162,7 @@ class Config(sections.Section):
 
     @property
     def cut_level(self) -> int | None:
-        """Return the largest whole ``S(d) - min S`` of the alpha-cut, ``floor((1 - alpha) * cost_span)``.
-
-        None without intervals or with a coverage.
-        """
+        """Return the largest ``S(d) - min S`` of a cut, ``floor((1 - alpha) * cost_span)``; None without alpha."""
         if self.interval is None or self.interval.alpha is None:
             return None
         return floor(self._excess(1 - Fraction(self.interval.alpha)))
@@ -198,10 +193,8 @@ class Config(sections.Section):
 
     @property
     def bound_steps(self) -> int:
-        """Return the steps per pixel of bounds in the tiles, a power of two; 1 for bounds in whole pixels.
-
-        With a coverage it is 64 up to 1024 disparities; beyond, the largest with which the range fits in 16 bits.
-        """
+        """Return the steps per pixel of bounds in the tiles, a power of two; 1 for bounds in whole pixels."""
+        # With a coverage it is 64 up to 1024 disparities; beyond, the largest with which the range fits in 16 bits.
         if not self.has_coverage:
             return 1
         steps = BOUND_STEPS
@@ -241,10 +234,7 @@ class Config(sections.Section):
 
 
 def key_of(config: Config) -> dict[str, Any]:
-    """Return all settings that decide which coverage a level reaches, as a calibration holds them.
-
-    Neither the search range nor alpha nor the quantile of the regularisation is among them.
-    """
+    """Return the settings that decide which coverage a level reaches: not search range, alpha, last quantile."""
     dumped = config.model_dump(mode="json")
     sgm, ambiguity, low = (dumped[name] for name in ("sgm", "ambiguity", "regularization"))
     return {

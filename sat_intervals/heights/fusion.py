@@ -13,12 +13,11 @@ _NARROWEST = 0.01  # metres: narrower intervals weigh as much as one of this wid
 
 
 def fused(gathered: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the bands of SURFACE, ``(6, rows, columns)`` float32, from the cells of each run, see `PointCloud.splat`.
-
-    Heights and middles of intervals are means weighted by ``1 / width^2``, widths those of the mean weight, not divided
-    by the root of the number of runs: errors of pairs of one place are correlated. Where intervals do not meet, their
-    hull is taken, and the height of the narrowest: a mean may be in none of them. Without any, all heights count.
-    """
+    """Return the bands of SURFACE, ``(6, rows, columns)`` float32, from the cells of runs, see `PointCloud.splat`."""
+    # Heights and middles of intervals are means weighted by ``1 / width^2``, widths those of the mean weight, not
+    # divided by the root of the number of runs: errors of pairs of one place are correlated. Where intervals do not
+    # meet, their hull is taken, and the height of the narrowest: a mean may be in none of them. Without any, all
+    # heights count.
     layers = np.stack(gathered, axis=1)  # of each layer, the cells of all runs
     count = layers[COUNT].sum(axis=0)
     weights = np.where(layers[COUNT] > 0, layers[WEIGHT], np.nan)

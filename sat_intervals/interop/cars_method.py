@@ -56,11 +56,9 @@ class SatIntervals(PandoraMethod, short_name=["sat_intervals"]):  # type: ignore
         self.margins = Margins(*4 * [resolved(self._config(0, 0)).tiles.support])
 
     def _config(self, minimum: int, maximum: int) -> Config:
-        """Return the settings with a search range.
-
-        Confidence is relative to this range: CARS' tiles are matched alone, and percentiles of each would make adjacent
-        ones differ. Calibrations belong to percentiles.
-        """
+        """Return the settings with a search range."""
+        # Confidence is relative to this range: CARS' tiles are matched alone, and percentiles of each would make
+        # adjacent ones differ. Calibrations belong to percentiles.
         settings = self.used_config["settings"]
         if "disparity" in settings or None in (settings.get("interval", {}), settings.get("ambiguity", {})):
             raise SatIntervalsError(

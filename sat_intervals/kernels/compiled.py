@@ -65,11 +65,9 @@ def cached(kernel):
 
 @contextmanager
 def kernels_of_others() -> Iterator[None]:
-    """Let packages that are imported in the block cache their kernels in our folder, without ``fastmath``, serial.
-
-    With ``fastmath``, results depend on the processor, and on whether this process has compiled the code or read it.
-    ``parallel`` loops over the few points of a call wait for their threads: on busy cores 18 times as long.
-    """
+    """Let packages that are imported in the block cache their kernels in our folder, without ``fastmath``, serial."""
+    # With ``fastmath``, results depend on the processor, and on whether this process has compiled the code or read it.
+    # ``parallel`` loops over the few points of a call wait for their threads: on busy cores 18 times as long.
     with _own_folder():
         numba.njit = lambda *signature, fastmath=False, parallel=False, **options: njit(*signature, **options)
         try:

@@ -12,10 +12,9 @@ from sat_intervals.products import COSINE_STEPS
 
 @part
 def _copy_row(features, r, factor, row):
-    """Copy the features of a row, times a factor, to contiguous memory.
-
-    The stride of the volume would make its rows collide in the cache: correlation would take 1.3 to 1.4 times as long.
-    """
+    """Copy the features of a row, times a factor, to contiguous memory."""
+    # The stride of the volume would make its rows collide in the cache: correlation would take 1.3 to 1.4 times as
+    # long.
     for f in range(features.shape[0]):
         for x in range(features.shape[2]):
             row[f, x] = factor * features[f, r, x]
@@ -23,11 +22,9 @@ def _copy_row(features, r, factor, row):
 
 @inlined
 def _correlate_four(here, there, c, start, curves):
-    """Costs of the pixels ``c .. c + 3``: ``curves[i, x]`` is that of pixel ``c + i`` and right pixel ``c + x``.
-
-    A cost is ``start`` plus the sum of products, rounded. Four pixels share each load of right features, and their
-    sums are independent: one pixel at a time takes 1.6 times as long.
-    """
+    """Costs of the pixels ``c .. c + 3``: ``curves[i, x]`` is that of pixel ``c + i`` and right pixel ``c + x``."""
+    # A cost is ``start`` plus the sum of products, rounded. Four pixels share each load of right features, and their
+    # sums are independent: one pixel at a time takes 1.6 times as long.
     features, width, size = here.shape[0], there.shape[1], curves.shape[1]
     for x in range(0, size, LANES):
         total_1 = total_2 = total_3 = total_4 = splat_float(start)

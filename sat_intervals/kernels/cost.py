@@ -58,11 +58,9 @@ def between(left: Codes, right: Codes) -> Costs:
 
 @cached
 def _census_words(pixels, arm, words):
-    """Shift the bits of each row of a window into its word: those above the centre into the first, below it the last.
-
-    ``arm`` is a tuple of as many items as the window's radius: the compiler knows how many, and unrolls the loops over
-    a row of the window. 5x5 takes 2.8 ms at 1024 x 1024, 5.1 ms with one neighbour at a time.
-    """
+    """Shift the bits of each row of a window into its word: above the centre into the first, below it the last."""
+    # ``arm`` is a tuple of as many items as the window's radius: the compiler knows how many, and unrolls the loops
+    # over a row of the window. 5x5 takes 2.8 ms at 1024 x 1024, 5.1 ms with one neighbour at a time.
     radius, side, one = len(arm), 2 * len(arm) + 1, np.uint32(1)
     rows, columns = words.shape[1:]
     for r in range(rows):
@@ -91,11 +89,8 @@ def _census_words(pixels, arm, words):
 
 @cached
 def window_state(state, radius):
-    """Union of the states of each window's pixels, 0 = usable: first along rows, then along columns.
-
-    ``state`` is ``(rows + 2 radius, columns + 2 radius)`` uint8; the result is ``(rows, columns)`` uint8.
-    5x5 takes 0.25 ms at 600 x 600, 13 ms with one window at a time.
-    """
+    """Union of the states of windows: uint8, ``(rows + 2 radius, columns + 2 radius)`` to ``(rows, columns)``."""
+    # First along rows, then along columns: 5x5 takes 0.25 ms at 600 x 600, 13 ms with one window at a time.
     rows, columns = state.shape[0] - 2 * radius, state.shape[1] - 2 * radius
     union = np.zeros((rows, columns), np.uint8)
     across = np.zeros((state.shape[0], columns), np.uint8)
@@ -205,11 +200,8 @@ def span_at(ranges, count, size, c):
 
 
 def volume_starts(cells: Cells, output: Window) -> np.ndarray:
-    """Where each row of pixels begins in a volume that holds the vectors ``[start, stop)`` of every pixel.
-
-    Returns ``(rows + 1,)`` int64; the last is the size of the volume. Vectors are those of `enter_cells`: kernels write
-    there without a check.
-    """
+    """Where each row begins in a volume of the vectors ``[start, stop)`` of every pixel: ``(rows + 1,)`` int64."""
+    # The last is the size of the volume. Vectors are those of `enter_cells`: kernels write there without a check.
     row, column = cells.row + output.row, cells.column + output.column
     vectors = cells.last // LANES + 1 - cells.first // LANES
     of_rows = vectors[:, np.arange(column, column + output.width) // cells.width].sum(axis=1)

@@ -12,10 +12,7 @@ from sat_intervals.products import IMPOSSIBLE_COST
 
 @inlined
 def first_at_most(curve, span, limit):
-    """First index whose cost is at most ``limit``: 14 ns for 64 disparities by vectors, 36 ns by single costs.
-
-    At least one cost is at most ``limit``.
-    """
+    """First index of a cost of at most ``limit``; there is one: 14 ns for 64 disparities, 36 ns by single costs."""
     k = span.start
     mask = lanes_at_most(load(curve, k), limit)
     while mask == 0:
@@ -26,11 +23,9 @@ def first_at_most(curve, span, limit):
 
 @inlined
 def alpha_cut(curve, span, limit):
-    """First and last index whose cost is at most ``limit`` (paper eq. 5 to 7).
-
-    It is ``lowest + floor((1 - alpha) * cost_span)``. The vectors of ``span`` have costs above every limit at other
-    candidates. Vectors take 19 ns for 64 disparities and 38 ns for 128, single costs 70 and 129 ns.
-    """
+    """First and last index whose cost is at most ``limit`` (paper eq. 5 to 7)."""
+    # It is ``lowest + floor((1 - alpha) * cost_span)``. The vectors of ``span`` have costs above every limit at other
+    # candidates. Vectors take 19 ns for 64 disparities and 38 ns for 128, single costs 70 and 129 ns.
     first = first_at_most(curve, span, limit)
     last = span.stop - LANES
     cut = lanes_at_most(load(curve, last), limit)
@@ -49,11 +44,9 @@ def _ceil(value):
 
 @inlined_unchecked
 def _crossing(curve, inside, outside, limit, settings):
-    """Steps from index ``inside`` to where the linear curve crosses ``limit`` before ``outside``, rounded up.
-
-    0 at the end of the range and beside an impossible candidate. ``curve[outside]`` is above ``limit``. Both cuts of a
-    pixel take 26 ns more than `alpha_cut` with these selections, 125 ns with branches, which are hard to predict.
-    """
+    """Steps from index ``inside`` to where the linear curve crosses ``limit`` before ``outside``, rounded up."""
+    # 0 at the end of the range and beside an impossible candidate. ``curve[outside]`` is above ``limit``. Both cuts of
+    # a pixel take 26 ns more than `alpha_cut` with these selections, 125 ns with branches, which are hard to predict.
     near = min(max(outside, 0), settings.count - 1)
     here, there = np.int64(curve[inside]), np.int64(curve[near])
     steps = _ceil(settings.steps * (limit - here) / max(there - here, 1))
@@ -68,10 +61,8 @@ def _limit(lowest, level):
 
 @inlined
 def _whole_cuts(curve, span, one, other):
-    """First and last index of the cuts at two limits, in one pass over the curve: ``(first, last)`` of each.
-
-    Every vector is visited, so that no branch depends on the curve: 16 ns for 64 disparities, 23 ns for 128.
-    """
+    """First and last index of the cuts at two limits, in one pass over the curve: ``(first, last)`` of each."""
+    # Every vector is visited, so that no branch depends on the curve: 16 ns for 64 disparities, 23 ns for 128.
     first_1 = first_2 = curve.size
     last_1 = last_2 = -1
     for k in range(span.start, span.stop, LANES):
@@ -86,10 +77,7 @@ def _whole_cuts(curve, span, one, other):
 
 @inlined
 def _subpixel_cut(curve, limit, cut, winner, settings):
-    """Bounds in steps where the curve crosses ``limit`` outside the whole cut, widened to hold ``winner``.
-
-    They count from the first disparity of the whole search range, of which this curve may be a part.
-    """
+    """Bounds in steps of the whole range, where the curve crosses ``limit`` around a cut, widened to ``winner``."""
     (first, last), origin = cut, settings.offset * settings.steps
     lower = first * settings.steps - _crossing(curve, first, first - 1, limit, settings)
     upper = last * settings.steps + _crossing(curve, last, last + 1, limit, settings)
@@ -216,10 +204,8 @@ def _quantile(counts, size, quantile):
 
 @part
 def _in_steps(lower, upper, low, minimum, per_pixel):
-    """Convert bounds to steps above ``minimum``, rounded outwards; return the number of bins and the steps.
-
-    The steps are ``(2, rows, columns)`` uint16, which takes half the time of int32.
-    """
+    """Convert bounds to steps above ``minimum``, rounded outwards: number of bins, ``(2, rows, columns)`` uint16."""
+    # uint16 takes half the time of int32.
     rows, columns = low.shape
     least = most = np.float32(minimum)
     scale = np.float32(per_pixel)

@@ -53,10 +53,7 @@ def columns_of(inside, r, down):
 
 @inlined
 def open_curve(curve, opened, span):
-    """Prepare a curve for a pixel: IMPOSSIBLE_COST outside its vectors.
-
-    ``opened`` are those of the pixel before, None if every pixel has all of them.
-    """
+    """Prepare a curve for a pixel: IMPOSSIBLE_COST outside its vectors; ``opened``: those before it, None: all."""
     if opened is None:
         return
     if opened[0] != span.start or opened[1] != span.stop:
@@ -104,11 +101,9 @@ class RightPixels(NamedTuple):
 
 @inlined
 def update_right(curve, span, right, r, c):
-    """Update the right pixels that a left pixel faces with its candidates.
-
-    The sweep up visits the left pixels of a row from right to left, so ``k`` ascends at each right pixel and ties go to
-    the largest.
-    """
+    """Update the right pixels that a left pixel faces with its candidates."""
+    # The sweep up visits the left pixels of a row from right to left, so ``k`` ascends at each right pixel and ties go
+    # to the largest.
     start = (r - right.core.row) * right.cost.shape[1] + c - right.core.column
     for k in range(span.start, span.stop, LANES):
         candidate, known = vector.load(curve, k), vector.load(right.cost, start + k)
@@ -160,9 +155,7 @@ def read_curve(curve, span, lowest, settings):
 
 @inlined
 def _distrusts(k, span, settings):
-    """Whether a winner is at or next to an end of its cell's range where the whole range goes on.
-
-    The true disparity may then be among the candidates of the whole range that were not searched: they are ambiguous.
-    """
+    """Whether a winner is at or next to an end of its cell's range where the whole range goes on."""
+    # The true disparity may then be among the candidates of the whole range that were not searched: they are ambiguous.
     first, last = settings.offset + span.first, settings.offset + span.last
     return (k <= span.first + 1 and first > 0) or (k >= span.last - 1 and last < settings.total - 1)

@@ -75,10 +75,8 @@ def slope_of(here, i, j):
 
 @cached
 def sampled(surface, block, x, y):
-    """Return ``(n,)`` heights of the nearest cell and its slope, NaN where unknown.
-
-    Interpolation between cells averages their noise: halfway, differences would be smaller than at the true shift.
-    """
+    """Return ``(n,)`` heights of the nearest cell and its slope, NaN where unknown."""
+    # Interpolation between cells averages their noise: halfway, differences would be smaller than at the true shift.
     result = np.full(x.size, np.nan)
     _, rows, columns = surface.shape
     for n in range(x.size):

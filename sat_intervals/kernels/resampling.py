@@ -79,10 +79,8 @@ def resample(pixels, origin, nodes, step, first, rows, columns):
 
 @cached
 def resample_reduced(pixels, origin, nodes, step, first, rows, columns, scale):
-    """Resample as `resample` does, with ``scale`` > 1 pixels of the image to one of the result.
-
-    The cubic is as much wider, so that finer detail than that of the result leaves no pattern.
-    """
+    """Resample as `resample` does, with ``scale`` > 1 pixels of the image to one of the result."""
+    # The cubic is as much wider, so that finer detail than that of the result leaves no pattern.
     result = np.empty((rows, columns), pixels.dtype)
     after = math.ceil(2 * scale)
     down, across = np.empty(2 * after), np.empty(2 * after)

@@ -52,10 +52,7 @@ def _fill_span(spans, slot, size):
 
 @inlined
 def _begin(paths, slot, first):
-    """State of a path before the candidate ``first`` of a pixel.
-
-    Returns the start of its curve, ``min L(q)``, L(q) of two blocks, and the least L so far.
-    """
+    """State of a path before a candidate: start of its curve, ``min L(q)``, L(q) of two blocks, least L so far."""
     start = slot * paths.curves.shape[1]
     before = vector.load(paths.curves, start + first - LANES) if first > 0 else vector.splat(np.uint16(WALL))
     here = vector.load(paths.curves, start + first)
@@ -139,12 +136,10 @@ def advance_wave(candidates, span, penalties, paths, slots, wave, r, c):
 
 @inlined
 def path_slots(c, columns, falling, rising):
-    """Slots of the paths through ``(r, c)``: along the row, the falling and the rising diagonal, the column.
-
-    A slot belongs to a line, not to a pixel, so that a sweep updates it in place, in either direction. The
-    diagonals through ``(r, c)`` are the lines ``c - r`` and ``c + r``, modulo the columns; ``falling = -r % columns``
-    and ``rising = r % columns`` come once a row: divisions at every pixel would make sweeps 5 % slower.
-    """
+    """Slots of the paths through ``(r, c)``: along the row, the falling and the rising diagonal, the column."""
+    # A slot belongs to a line, not to a pixel, so that a sweep updates it in place, in either direction. The diagonals
+    # through ``(r, c)`` are the lines ``c - r`` and ``c + r``, modulo the columns; ``falling = -r % columns`` and
+    # ``rising = r % columns`` come once a row: divisions at every pixel would make sweeps 5 % slower.
     falling += c
     rising += c
     if falling >= columns:
@@ -186,10 +181,8 @@ def copy_curve(curve, target):
 
 @part
 def enter_row(paths, columns, falling, rising, down):
-    """Restart the paths that enter the patch in this row: along it, and the diagonals at its two ends.
-
-    The slot of a diagonal that enters holds the path that left the patch at the other end of the previous row.
-    """
+    """Restart the paths that enter the patch in this row: along it, and the diagonals at its two ends."""
+    # The slot of a diagonal that enters holds the path that left the patch at the other end of the previous row.
     first, last = path_slots(0, columns, falling, rising), path_slots(columns - 1, columns, falling, rising)
     restart(paths, (0, first[1], last[2]) if down else (0, last[1], first[2]))
 

@@ -137,10 +137,7 @@ def new_buffers(
 
 @part
 def _enter_row(buffers, gradients, settings, r):
-    """Fill a row's barrier, numbers of possible candidates and penalties, and start the paths that enter it.
-
-    Returns ``falling`` and ``rising``, the row's arguments of `path_slots`.
-    """
+    """Fill a row's buffers and start the paths that enter it; return ``falling`` and ``rising`` of `path_slots`."""
     candidates, cells, ranges, usable, possible, penalties, paths, curve, _, inside, around, _, down = buffers
     costs, barrier = candidates.costs, candidates.barrier
     for x in range(costs.right_state.shape[1]):

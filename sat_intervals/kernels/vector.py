@@ -55,10 +55,7 @@ def _primitive(result, *parameters):
 
 
 def _on_array(result, *parameters):
-    """Make an intrinsic on a C-contiguous array of a function ``build(builder, data, index, *values)``.
-
-    ``data`` is the address of the first element.
-    """
+    """Make an intrinsic on a C-contiguous array of ``build(builder, its address, index, *values)``."""
 
     def intrinsic_of(build):
         def typed(typing_context, array, *arguments):
@@ -235,10 +232,7 @@ def lanes_above_last(builder, mask):
 
 @intrinsic
 def hamming(typing_context, words, index, word):
-    """Return the Hamming distances of 32 consecutive words of a contiguous array to one word.
-
-    ``words`` is uint32 or uint64. The caller adds up the distances of codes of several words.
-    """
+    """Return the Hamming distances of 32 consecutive words of an array, contiguous uint32 or uint64, to one word."""
 
     def generate(context, builder, signature, arguments):
         array, index, word = arguments

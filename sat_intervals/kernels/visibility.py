@@ -44,10 +44,7 @@ def _is_in_wall(surface, x, y, z, steepest):
 
 @cached
 def tops(surface):
-    """Return the largest known height in each block of `BLOCK` x `BLOCK` cells and the eight around it.
-
-    -inf where there is none: ``(rows, columns)`` of blocks.
-    """
+    """Return the largest height of each block of `BLOCK` x `BLOCK` cells and the eight around it, -inf for none."""
     rows, columns = surface.shape
     blocks = np.full(((rows - 1) // BLOCK + 3, (columns - 1) // BLOCK + 3), -np.inf, surface.dtype)
     for r in range(rows):

@@ -59,10 +59,9 @@ def _around(wavefront: int, patch: Window, borders: Mapping[Place, Border], size
 
 
 def rehulled(edge: Edge, minimum: int, config: Config) -> Edge:
-    """States of a neighbour, whose first disparity is ``minimum``, over the search range of ``config``.
-
-    A disparity that only one of the two searches is outside the cells of the pixels that they share: it is impossible.
-    """
+    """States of a neighbour, whose first disparity is ``minimum``, over the search range of ``config``."""
+    # A disparity that only one of the two searches is outside the cells of the pixels that they share: it is
+    # impossible.
     size, shift = padded_to_lanes(config.disparity.count), config.disparity.minimum - minimum
     found = []
     for states in edge:

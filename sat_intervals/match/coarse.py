@@ -237,10 +237,8 @@ def find_range(left: np.ndarray, right: np.ndarray, step: Step, shape: tuple[int
 
 
 def _local(matches: Matches, minimum: int, maximum: int, shape: tuple[int, int]) -> LocalRanges:
-    """Local ranges from the matches of a level: those of a cell and its neighbours, with a margin.
-
-    Cells without enough matches get the whole range, cells without a usable pixel the range of their neighbours.
-    """
+    """Local ranges from the matches of a level: those of a cell and its neighbours, with a margin."""
+    # Cells without enough matches get the whole range, cells without a usable pixel the range of their neighbours.
     rows, columns = (-(-side // (_CELL * size)) for side, size in zip(shape, matches.step, strict=True))
 
     def in_cells(values: np.ndarray, nothing: Any) -> np.ndarray:
@@ -273,10 +271,8 @@ def settings(first: int, last: int) -> Config:
 
 
 def _matches_of(left: np.ndarray, right: np.ndarray, search: np.ndarray | None, speckle: int) -> Matches:
-    """Match a level; search further where many matches stand at an end of what was searched.
-
-    ``search`` is None at the coarsest level: there the second search is that of all disparities.
-    """
+    """Match a level; search further where many matches stand at an end of what was searched."""
+    # ``search`` is None at the coarsest level: there the second search is that of all disparities.
     most = 1 - left.shape[1], right.shape[1] - 1
     reach, wider = int(_REACH * left.shape[1]), right.shape[1] - left.shape[1]
     ends = (min(0, wider) - reach, max(0, wider) + reach) if search is None else search
@@ -297,10 +293,7 @@ def _matches_of(left: np.ndarray, right: np.ndarray, search: np.ndarray | None, 
 
 
 def match_level(left: np.ndarray, right: np.ndarray, searched: tuple[int, int], speckle: int) -> Matches:
-    """Match a level over the disparities ``searched`` strip by strip; remove surfaces of less than ``speckle`` pixels.
-
-    ``left`` and ``right`` are float32, NaN where not usable.
-    """
+    """Match float32 images, NaN where not usable, strip by strip; remove surfaces of less than ``speckle`` pixels."""
     first, last = searched
     usable = np.count_nonzero(np.isfinite(left))
     config = settings(first, last)

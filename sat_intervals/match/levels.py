@@ -144,10 +144,8 @@ def _level(fields: np.ndarray, levels: np.ndarray, coverage: float) -> float | N
 
 
 def at_level(fields: np.ndarray, levels: np.ndarray, level: float) -> np.ndarray:
-    """Measurement at a level: ``(thresholds, fields)`` to ``(fields,)``.
-
-    Between thresholds, misses fall geometrically, since they fall nearly exponentially with the level.
-    """
+    """Measurement at a level: ``(thresholds, fields)`` to ``(fields,)``."""
+    # Between thresholds, misses fall geometrically, since they fall nearly exponentially with the level.
     above = int(np.clip(np.searchsorted(levels, level), 1, levels.size - 1))
     share = (level - levels[above - 1]) / (levels[above] - levels[above - 1])
     found = (1 - share) * fields[above - 1] + share * fields[above]

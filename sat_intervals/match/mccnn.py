@@ -57,10 +57,8 @@ class Network:
         self.count = int(features.shape[0])
 
     def __call__(self, pixels: np.ndarray) -> np.ndarray:
-        """Features ``(count, rows - 10, columns - 10)`` of normalised pixels ``(rows, columns)``, float32.
-
-        A feature of NaN, that of a window without texture, becomes zeros, whose cosine with any feature is 0.
-        """
+        """Features ``(count, rows - 10, columns - 10)`` of normalised pixels ``(rows, columns)``, float32."""
+        # A feature of NaN, that of a window without texture, becomes zeros, whose cosine with any feature is 0.
         features = np.asarray(self._session.run(None, {self._input: pixels})[0])
         undefined = np.isnan(features[:1]).all(axis=0)
         if undefined.any():

@@ -136,11 +136,9 @@ class Survey:
 
 
 def fit_rows(samples: Sequence[BlockMatch], rows: int, columns: int) -> RowFit | None:
-    """Fit the row offsets of sample blocks of a pair; ``rows`` and ``columns`` are those of the right image.
-
-    Of polynomials the one of the lowest degree is taken unless a higher one leaves clearly less in samples that it was
-    not fitted to; a constant where none holds. None with fewer than three samples.
-    """
+    """Fit the row offsets of sample blocks of a pair; ``rows`` and ``columns`` are those of the right image."""
+    # Of polynomials the one of the lowest degree is taken unless a higher one leaves clearly less in samples that it
+    # was not fitted to; a constant where none holds. None with fewer than three samples.
     matching = [sample for sample in samples if sample.share >= _MATCHED]
     share, samples = len(matching) / max(1, len(samples)), matching or samples
     if len(samples) < _FEWEST:

@@ -100,10 +100,8 @@ def frames_of(left: PatchFrame, config: Config) -> list[PatchFrame]:
 
 
 def mirrored_frame(frame: PatchFrame, config: Config) -> PatchFrame:
-    """Frame of the right view: the pixels that face a left core at the smallest disparity.
-
-    The last core of a row also has the others that face it, so that each right pixel belongs to one core.
-    """
+    """Frame of the right view: the pixels that face a left core at the smallest disparity."""
+    # The last core of a row also has the others that face it, so that each right pixel belongs to one core.
     search, (core, region, whole, _) = config.disparity, frame
     last = search.minimum if core.column_stop < region.column_stop else search.maximum
     around, all_facing = (facing(there, search.minimum, search.maximum) for there in (region, whole))
@@ -131,10 +129,8 @@ def _supported(frame: PatchFrame, config: Config) -> Window:
 
 
 def patch_areas(frame: PatchFrame, config: Config, ranges: LocalRanges | None = None) -> list[Area]:
-    """Area of a core with what it reads around it and, for accurate cross-checking, that of the right view.
-
-    The area may leave the region, but not the image.
-    """
+    """Area of a core with what it reads around it and, for accurate cross-checking, that of the right view."""
+    # The area may leave the region, but not the image.
     overlap = config.tiles.overlap
     if overlap == "exact":
         return [frame_area(view, config, ranges) for view in frames_of(frame, config)]
@@ -193,20 +189,15 @@ def _mark_ambiguous(raw: Raw, flat: np.ndarray, config: Config) -> None:
 
 
 def _mark_ends(raw: Raw, flat: np.ndarray, search: Disparity) -> None:
-    """Set the flag of winners at the first two and the last two candidates; a short range consists of ends only.
-
-    ``flat`` marks textureless pixels, whose winner means nothing.
-    """
+    """Set the flag of winners, ``flat`` aside, at the first and last two candidates; a short range has ends only."""
     if search.count > _SHORT:
         ends = (raw.winner <= search.minimum + 1) | (raw.winner >= search.maximum - 1)
         raw.validity[ends & (raw.winner != NO_DISPARITY) & ~flat] |= RANGE_END
 
 
 def _reject_ends(raw: Raw, least: np.ndarray, most: np.ndarray, search: Disparity) -> None:
-    """Reject winners at or next to an end, ``least`` or ``most``, of their cell's range where the whole range goes on.
-
-    They may not be minima of the cost. The cross-check would reject most of them in a search of the whole range.
-    """
+    """Reject winners at or beside an end, ``least`` or ``most``, of their cell's range where the whole one goes on."""
+    # They may not be minima of the cost. The cross-check would reject most of them in a search of the whole range.
     ends = (raw.winner <= least + 1) & (least > search.minimum)
     ends |= (raw.winner >= most - 1) & (most < search.maximum)
     ends &= raw.winner != NO_DISPARITY

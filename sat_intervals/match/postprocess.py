@@ -83,11 +83,9 @@ class ConfidenceScale(NamedTuple):
 
 
 def confidence_scale(settings: Ambiguity, histogram: np.ndarray) -> ConfidenceScale:
-    """Scale of confidence: given figures, the whole range, or percentiles of the whole image.
-
-    ``histogram`` counts the ambiguities of all pixels with a possible candidate. Equal percentiles cannot rank pixels,
-    so the whole range replaces them.
-    """
+    """Scale of confidence: given figures, the whole range, or percentiles of the whole image."""
+    # ``histogram`` counts the ambiguities of all pixels with a possible candidate. Equal percentiles cannot rank
+    # pixels, so the whole range replaces them.
     if settings.p1 is not None and settings.p99 is not None:
         return ConfidenceScale(settings.p1, settings.p99)
     p1, p99 = (quantile(np.arange(histogram.size), histogram, share) for share in (0.01, 0.99))
@@ -103,10 +101,7 @@ def halo(config: Config) -> int:
 
 
 def postprocess_rows(rows: RawRows, first: int, last: int, scale: ConfidenceScale, config: Config) -> products.Bands:
-    """Final bands of the rows ``[first, last)``, counted from the first of ``rows``.
-
-    ``rows`` has these rows and at least `halo` rows above and below, inside the region.
-    """
+    """Final bands of the rows ``[first, last)`` of ``rows``, which has `halo` more on both sides in the region."""
     filtered = filter_rows(rows, scale, config)
     inner, cuts = slice(first, last), config.cuts
     validity, low = filtered.validity[inner].copy(), filtered.low
@@ -169,10 +164,8 @@ def widened(
 
 
 def _bounds(rows: RawRows, low: np.ndarray | None, kept: np.ndarray, config: Config) -> tuple[np.ndarray, np.ndarray]:
-    """Both bounds in pixels as float32, of the level of each pixel's class, after the median.
-
-    With least squares the cuts of the two classes differ much, so each is filtered on its own.
-    """
+    """Both bounds in pixels as float32, of the level of each pixel's class, after the median."""
+    # With least squares the cuts of the two classes differ much, so each is filtered on its own.
     if config.interval is None:
         nothing = np.full(rows.lower.shape, np.float32(np.nan))
         return nothing, nothing

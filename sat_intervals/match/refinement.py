@@ -51,10 +51,8 @@ def refined(disparity: np.ndarray, kept: np.ndarray, left: np.ndarray, right: np
 def bounds_of_both(
     fits: Refined, lower: np.ndarray, upper: np.ndarray, factor: float, config: Config
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bounds that cost curve and fit give together, inside the search range.
-
-    On either side ``factor (.2 + deviation) (.3 + distance to the bound of the cut)`` from the disparity.
-    """
+    """Return the bounds that cost curve and fit give together, inside the search range."""
+    # On either side ``factor (.2 + deviation) (.3 + distance to the bound of the cut)`` from the disparity.
     disparity, search = fits.disparity, config.disparity
     scale = np.float32(factor) * (_LEAST + np.where(np.isnan(fits.deviation), _NO_FIT, fits.deviation))
     below, above = (scale * (_SIDE + np.maximum(side, 0)) for side in (disparity - lower, upper - disparity))

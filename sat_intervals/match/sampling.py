@@ -111,10 +111,8 @@ def _coarse(left: View, right: View) -> tuple[Matches, int] | None:
 
 
 def _likeliest_rows(left: np.ndarray, right: np.ndarray) -> int:
-    """Return the rows of a level, whose right image has `_MOST` more at both ends, at which candidates fit best.
-
-    Each cell of some pixels has the candidate, one disparity for all, whose codes differ least.
-    """
+    """Return the rows of a level, whose right image has `_MOST` more at both ends, at which candidates fit best."""
+    # Each cell of some pixels has the candidate, one disparity for all, whose codes differ least.
     margin = _CENSUS // 2
     views = (_view(image) for image in (left, right))
     here, there = (census(*cut(view, view.window.grown(margin, margin))[1:], _CENSUS) for view in views)

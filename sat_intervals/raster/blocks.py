@@ -42,10 +42,8 @@ def factors(height: int, width: int) -> list[int]:
 
 
 def halved(bands: np.ndarray) -> np.ndarray:
-    """Return ``(bands, rows, columns)`` at half the size: means of the known of 4 values, or every other flag.
-
-    A value whose 4 have less than 2 known is unknown, so that shares of what is known stay.
-    """
+    """Return ``(bands, rows, columns)`` at half the size: means of the known of 4 values, or every other flag."""
+    # A value whose 4 have less than 2 known is unknown, so that shares of what is known stay.
     if bands.dtype.kind != "f":
         return bands[:, ::2, ::2]
     rows, columns = (-(-size // 2) for size in bands.shape[1:])

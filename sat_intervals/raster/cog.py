@@ -50,10 +50,8 @@ CopyParts = Callable[[Path, Sequence[tuple[int, Part]]], None]
 
 
 def template(file: File, place: Georeferencing, tags: Mapping[str, str]) -> bytes:
-    """Return a small Cloud-Optimized GeoTIFF with one overview and all tags of a file.
-
-    It is made in memory: GDAL says nothing of some failures to write to a disk.
-    """
+    """Return a small Cloud-Optimized GeoTIFF with one overview and all tags of a file."""
+    # It is made in memory: GDAL says nothing of some failures to write to a disk.
     kind = {"count": len(file.bands), "dtype": file.dtype, "nodata": file.nodata, "sparse_ok": True}
     options = {"COMPRESS": file.compression.upper(), "PREDICTOR": file.predictor, "BLOCKSIZE": _SMALL}
     kind |= tiled(file) | {"blockxsize": _SMALL, "blockysize": _SMALL, "height": _SMALL + 1, "width": _SMALL + 1}

@@ -169,10 +169,8 @@ def opened(path: str, window: Window | None = None) -> Iterator[DatasetReader]:
 
 
 def _absolute(path: str | os.PathLike[str]) -> str:
-    """Return the absolute path of a local file, also of a zip archive, and other GDAL names unchanged.
-
-    ``link/..`` is the folder above the target of the link, which `os.path.abspath` takes for that above the link.
-    """
+    """Return the absolute path of a local file, also of a zip archive, and other GDAL names unchanged."""
+    # ``link/..`` is the folder above the target of the link, which `os.path.abspath` takes for that above the link.
     name = os.fspath(path)
     if (inside := in_zip(name)) and inside.at:
         return f"/vsizip/{{{Path(str(inside.root.filename)).absolute()}}}/{inside.at}"  # paths have no double slash

@@ -102,10 +102,7 @@ def covered_window(path: Path, place: Georeferencing, shape: tuple[int, int]) ->
 def read_heights(
     path: Path, place: Georeferencing, shape: tuple[int, int], window: Window, *, smooth: bool = False
 ) -> np.ndarray:
-    """Read the first band, scaled, at the centres of the cells in a window of a grid, NaN if unknown.
-
-    ``smooth`` interpolates, otherwise the nearest pixel is used.
-    """
+    """Read band 1, scaled, at the cells of a window, NaN if unknown; interpolated if ``smooth``, else the nearest."""
     height, width = shape
     grid = {"crs": place.crs, "transform": place.transform, "height": height, "width": width}
     grid |= {"resampling": Resampling.bilinear if smooth else Resampling.nearest}

@@ -117,10 +117,8 @@ def read_inside(image: Image, window: Window, shape: tuple[int, int] | None = No
 
 
 def _differs(values: np.ndarray, nodata: float | None) -> np.ndarray:
-    """Return where values differ from the no-data value; uint8 never equals 300.
-
-    A float32 may differ by what seven written digits leave out, and any float by more near the largest ones.
-    """
+    """Return where values differ from the no-data value; uint8 never equals 300."""
+    # A float32 may differ by what seven written digits leave out, and any float by more near the largest ones.
     if nodata is None:
         return np.ones(values.shape, bool)
     with np.errstate(over="ignore", invalid="ignore"):
