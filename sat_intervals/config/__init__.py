@@ -1,13 +1,12 @@
 """Settings: defaults, ranges, one-line descriptions and derived thresholds."""
 
-from sat_intervals.config.calibrated import calibration_of, resolved, unreached
 from sat_intervals.config.calibration import Calibration, load_calibration
 from sat_intervals.config.costs import Census, Mccnn, Volume
 from sat_intervals.config.height_calibration import HeightCalibration, WidthClass, load_height_calibration, surface_key
 from sat_intervals.config.interval import Interval
 from sat_intervals.config.penalties import MccnnSgm, Sgm
 from sat_intervals.config.presets import PRESETS, preset_text
-from sat_intervals.config.reading import load_config, named_files, read_yaml
+from sat_intervals.config.reading import calibration_of, load_config, named_files, read_yaml, resolved, unreached
 from sat_intervals.config.sections import Ambiguity, Cluster, ConfigError, Disparity, Regularization
 from sat_intervals.config.settings import Config, key_of
 from sat_intervals.config.wording import allowed

@@ -1,4 +1,4 @@
-"""Read settings from YAML files, mappings and the command line."""
+"""Read settings from YAML files, mappings and the command line; find the calibration that belongs to them."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -6,11 +6,12 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from sat_intervals.config.calibration import MAKE_ONE, Calibration, built_in, differences
 from sat_intervals.config.costs import NETWORKS
 from sat_intervals.config.files import read_mapping
 from sat_intervals.config.presets import PRESETS, merged, preset_settings
 from sat_intervals.config.sections import ConfigError
-from sat_intervals.config.settings import Config
+from sat_intervals.config.settings import Config, key_of
 from sat_intervals.config.wording import explained, shown
 
 # Settings that name a file.
@@ -110,3 +111,33 @@ def read_yaml(file: Path) -> Mapping[str, Any]:
     if {"key", "levels"} <= values.keys():
         raise ConfigError(f"{file} is a calibration: give it by --calibration, with --coverage")
     return values
+
+
+def calibration_of(config: Config) -> Calibration:
+    """Return the calibration of the settings: the one that they give, else the built-in one with their key."""
+    assert config.interval is not None
+    given, key = config.interval.calibration, key_of(config)
+    if not isinstance(given, Calibration):
+        return built_in(key, config.preset)
+    if different := differences(given.key, key):
+        raise ConfigError(f"calibration {given.name} belongs to other settings, {different[0]}: {MAKE_ONE}")
+    return given
+
+
+def resolved(config: Config) -> Config:
+    """Return the settings with the content of their calibration, which decides the bytes of a run."""
+    if config.interval is None or config.interval.coverage is None:
+        return config
+    interval = config.interval.model_copy(update={"calibration": calibration_of(config)})
+    return config.model_copy(update={"interval": interval})
+
+
+def unreached(config: Config) -> str:
+    """Return a warning if the calibration does not reach the coverage asked for; else, and with alpha, ``""``."""
+    levels = config.cuts
+    if levels is None or levels.reached:
+        return ""
+    return (
+        f"the pairs of calibration {calibration_of(config).name} do not reach coverage {levels.coverage:g} at any "
+        "level: expect less, or ask for less"
+    )

@@ -169,7 +169,7 @@ class Config(sections.Section):
 
     @property
     def cuts(self) -> Levels | None:
-        """Return the levels of the calibration, None without a coverage; `calibrated.resolved` checks that it fits."""
+        """Return the levels of the calibration, None without a coverage; `reading.resolved` checks that it fits."""
         if self.interval is None or self.interval.coverage is None:
             return None
         given = self.interval.calibration
@@ -234,7 +234,7 @@ class Config(sections.Section):
 
 
 def key_of(config: Config) -> dict[str, Any]:
-    """Return the settings that decide which coverage a level reaches: not search range, alpha, last quantile."""
+    """Return the settings that decide which coverage a level reaches; search range and alpha are not among them."""
     dumped = config.model_dump(mode="json")
     sgm, ambiguity, low = (dumped[name] for name in ("sgm", "ambiguity", "regularization"))
     return {
