@@ -51,7 +51,7 @@ def plot(
     """  # noqa: D301 (\b keeps the line breaks in click)
     from sat_intervals.errors import SatIntervalsError
     from sat_intervals.results import open_results
-    from sat_intervals.show.coverage import check_one_pair, draw_coverage
+    from sat_intervals.show.accuracy import check_one_pair, draw_coverage
     from sat_intervals.show.maps import draw_errors, draw_overview
     from sat_intervals.show.preparation import draw_range, draw_rows, has_range, has_rows
     from sat_intervals.show.profile import draw_curve, draw_profile
