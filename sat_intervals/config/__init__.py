@@ -1,7 +1,7 @@
 """Settings: defaults, ranges, one-line descriptions and derived thresholds."""
 
 from sat_intervals.config.calibration import Calibration, load_calibration
-from sat_intervals.config.costs import Census, Mccnn, Volume
+from sat_intervals.config.costs import Census, Mccnn, Sweep, Volume
 from sat_intervals.config.height_calibration import HeightCalibration, WidthClass, load_height_calibration, surface_key
 from sat_intervals.config.interval import Interval
 from sat_intervals.config.penalties import MccnnSgm, Sgm
@@ -13,7 +13,7 @@ from sat_intervals.config.wording import allowed
 
 __all__ = [
     "PRESETS", "Ambiguity", "Calibration", "Census", "Cluster", "Config", "ConfigError", "Disparity",
-    "HeightCalibration", "Interval", "Mccnn", "MccnnSgm", "Regularization", "Sgm", "Volume", "WidthClass", "allowed",
-    "calibration_of", "key_of", "load_calibration", "load_config", "load_height_calibration", "named_files",
+    "HeightCalibration", "Interval", "Mccnn", "MccnnSgm", "Regularization", "Sgm", "Sweep", "Volume", "WidthClass",
+    "allowed", "calibration_of", "key_of", "load_calibration", "load_config", "load_height_calibration", "named_files",
     "preset_text", "read_yaml", "resolved", "surface_key", "unreached",
 ]  # fmt: skip

@@ -48,6 +48,7 @@ class _Cost(Section):
     column_bytes: ClassVar[int] = 0  # of temporary arrays, for each column of a patch
     needs_statistics: ClassVar[bool] = False  # mean and standard deviation of the whole images
     has_right_view: ClassVar[bool] = True  # the right view has costs of its own, and cells have ranges of their own
+    compares_two: ClassVar[bool] = True  # images: a left and a right one
     packages: ClassVar[tuple[str, ...]] = ()  # whose versions decide the costs
     named_by: ClassVar[str] = "method"  # key that decides the numbers, for messages
 
@@ -60,6 +61,11 @@ class _Cost(Section):
     def is_logarithmic(self) -> bool:
         """Return whether costs are logarithms of probabilities."""
         return False
+
+    @property
+    def rejected(self) -> float:
+        """Return the share of the pixels, of lowest confidence, that are not kept."""
+        return 0.0
 
     @classmethod
     def completed(cls, cost: Mapping[str, Any], sgm: Any) -> Any:
@@ -220,5 +226,37 @@ class Volume(_Cost):
         return self
 
 
-AnyCost = Annotated[Census | Mccnn | Volume, Field(discriminator="method")]
+class Sweep(_Cost):
+    """Matching cost: Census of many images resampled to the ground at each height; a unit is a bit.
+
+    Disparities are steps of height.
+    """
+
+    method: Literal["sweep"] = Field("sweep", description="many images, compared at heights above the ground")
+    share: Exact = Field(Decimal("0.4"), gt=0, le=1, description="of the pairs that see a cell, the best that count")
+    pairs: int = Field(3, ge=1, le=16, description="pairs of images to compare, for each image")
+    step: float | None = Field(None, gt=0, description="metres between heights; null: half a pixel of parallax")
+    doubtful: float = Field(0.05, ge=0, lt=1, description="share of cells, of lowest confidence, without height")
+
+    window: ClassVar = 5
+    precomputed = 1
+    converted = 1
+    has_right_view = False
+    compares_two = False
+
+    @property
+    def rejected(self) -> float:
+        """Return the share of the cells, of lowest confidence, that are not kept."""
+        return self.doubtful
+
+    def numbers(self, p2: Fraction | None) -> Numbers:
+        """Return the integer costs: tenths of a bit, in a byte."""
+        return Numbers(10 * (self.window**2 - 1), Fraction(10), 20)
+
+    def key(self) -> dict[str, Any]:
+        """Return what decides which coverage a level reaches, for calibrations."""
+        return self.model_dump(mode="json", include={"method", "share"})
+
+
+AnyCost = Annotated[Census | Mccnn | Volume | Sweep, Field(discriminator="method")]
 SECTIONS = {section.model_fields["method"].default: section for section in get_args(get_args(AnyCost)[0])}

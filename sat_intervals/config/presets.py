@@ -10,7 +10,7 @@ import yaml
 from sat_intervals.config.sections import Section
 
 # The first is the default: its settings are the defaults of all sections.
-PRESETS = ("satellite", "satellite-mccnn", "paper", "mccnn")
+PRESETS = ("satellite", "satellite-mccnn", "paper", "mccnn", "many")
 
 
 def preset_text(name: str = PRESETS[0]) -> str:

@@ -81,6 +81,11 @@ class Config(sections.Section):
                 f"cost.method {self.cost.method} goes with one search range and cross_check.method fast: leave out "
                 "local ranges and accurate"
             )
+        if not self.cost.compares_two and (self.cross_check or self.fits or self.disparity.around):
+            raise ValueError(
+                f"cost.method {self.cost.method} has no right image: set cross_check to null, refinement.method to "
+                "vfit, and leave out around"
+            )
         # Neighbouring tiles are compared on a ring of one pixel around the core, which needs complete windows.
         smallest = self.cost.window // 2 + 1
         if self.tiles.overlap != "exact" and self.tiles.overlap < smallest:

@@ -19,7 +19,7 @@ from sat_intervals.config.settings import Config
 def allowed(field: FieldInfo) -> str:
     """Describe the allowed values of a setting from its type and bounds, such as ``integer >= 1, odd``."""
     nouns = {int: "integer", float: "number", Decimal: "number", bool: "true or false", str: "text"}
-    signs = {"ge": ">=", "gt": ">", "le": "<=", "multiple_of": "multiple of"}
+    signs = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<", "multiple_of": "multiple of"}
     kinds = get_args(field.annotation) or (field.annotation,)
     constraints = [*field.metadata, *(of_kind for kind in kinds for info in _bounds(kind) for of_kind in info.metadata)]
     kinds = tuple(get_args(kind)[0] if hasattr(kind, "__metadata__") else kind for kind in kinds)

@@ -9,6 +9,8 @@ import numpy as np
 from sat_intervals.config import Config
 from sat_intervals.kernels.cost import Cells, Costs
 from sat_intervals.kernels.penalties import Gradients, Rule
+from sat_intervals.match.ground import GroundViews
+from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.tiling import View, Views, Window, facing, hull
 
@@ -58,12 +60,14 @@ class AreaCosts(NamedTuple):
     gradients: that the penalties follow; None for constant penalties.
     state: ``(rows, columns)`` uint8: states of the base's pixels.
     views: images whose windows say which pixels have no texture; None if the cost does not know.
+    seen: ``(rows, columns)`` uint8: how many images that see the base's pixels; None of two images.
     """
 
     costs: Costs
     gradients: Gradients | None
     state: np.ndarray
     views: Views | None
+    seen: np.ndarray | None = None
 
 
 class Given(NamedTuple):
@@ -72,11 +76,14 @@ class Given(NamedTuple):
     statistics: of the whole images; None if the matching cost needs none.
     inputs: what identified the files of the cost at the start; None: nothing is compared.
     volume_of: makes the volumes of another matcher.
+    ground, ranges: where many images show the cells of the ground, and their local ranges.
     """
 
     statistics: PairStatistics | None = None
     inputs: Mapping[str, Any] | None = None
     volume_of: VolumeOf | None = None
+    ground: GroundViews | None = None
+    ranges: LocalRanges | None = None
 
 
 class MatchingCost:
@@ -89,7 +96,7 @@ class MatchingCost:
     def check(config: Config) -> None:
         """Raise if the costs of these settings cannot be computed on this machine."""
 
-    def windows(self, areas: Sequence[Area]) -> tuple[Window, Window]:
+    def windows(self, areas: Sequence[Area]) -> tuple[Window, ...]:
         """Return the window of each image that the costs of areas need; the areas are in the same rows."""
         return view_windows(areas, self._config)
 

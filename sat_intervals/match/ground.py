@@ -1,0 +1,190 @@
+"""Where many images show the cells of a grid on the ground, and their costs there (METHOD.md, section 20).
+
+Disparities are steps of height: ``base + step * disparity`` metres above the ellipsoid. Costs are made block by block
+of BLOCK x BLOCK cells, counted from the first cell: within a block the images move with the height as at its middle.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from sat_intervals.config import Config, Sweep
+from sat_intervals.kernels.plane_sweep import FINE, RADIUS, planes_of, sweep
+from sat_intervals.kernels.resampling import resample
+from sat_intervals.kernels.row_offsets import AFTER, BEFORE
+from sat_intervals.tiling import View, Views, Window
+
+# Side of a block in cells: views of satellites turn by less than a hundredth of a pixel within it.
+BLOCK = 64
+# Cells between nodes of a fine grid.
+_NODES = 16
+# Cells around those of a block that the fine grid needs: the window, and a cubic.
+_AROUND = RADIUS + 2
+
+
+@dataclass(frozen=True)
+class GroundViews:
+    """Where images show the cells of a grid on the ground.
+
+    places: ``(images, heights, rows, columns, 2)`` float64: row and column in each image, whose pixel centres are
+        integers, of the first corners of blocks, and of the last ones, at heights.
+    lowest, spacing: metres of the first height, and between heights.
+    reductions: pixels along a side of each image that are averaged.
+    pairs: ``(pairs, 2)`` int64: images to compare.
+    base, step: metres of disparity 0, and of a disparity.
+    shape: rows and columns of cells.
+    """
+
+    places: np.ndarray
+    lowest: float
+    spacing: float
+    reductions: tuple[int, ...]
+    pairs: np.ndarray
+    base: float
+    step: float
+    shape: tuple[int, int]
+
+    def shifted(self, shifts: np.ndarray) -> "GroundViews":
+        """Return the views with rows and columns added to all positions, ``(images, 2)``."""
+        return replace(self, places=self.places + shifts[:, None, None, None, :])
+
+    def corners(self, image: int, block: tuple[int, int], disparities: np.ndarray) -> np.ndarray:
+        """Return ``(n, 2, 2, 2)``: positions of a block's corners in an image, reduced, at disparities ``(n,)``."""
+        row, column = block
+        at = (self.base + self.step * disparities - self.lowest) / self.spacing
+        i = np.clip(np.floor(at).astype(int), 0, self.places.shape[1] - 2)
+        of_levels = self.places[image, :, row : row + 2, column : column + 2]
+        part = (at - i)[:, None, None, None]
+        reduction = self.reductions[image]
+        return np.asarray(((1 - part) * of_levels[i] + part * of_levels[i + 1] - (reduction - 1) / 2) / reduction)
+
+    def positions(self, image: int, window: Window, disparity: np.ndarray) -> np.ndarray:
+        """Return ``(rows, columns, 2)``: positions in an image, reduced, of the cells of a window at disparities."""
+        at = (self.base + self.step * disparity - self.lowest) / self.spacing
+        rows, columns = np.mgrid[window.row : window.row_stop, window.column : window.column_stop]
+        axes = at, (rows + 0.5) / BLOCK, (columns + 0.5) / BLOCK
+        whole, parts = [], []
+        for axis, count in zip(axes, self.places.shape[1:4], strict=True):
+            whole.append(np.clip(np.floor(axis).astype(int), 0, count - 2))
+            parts.append((axis - whole[-1])[..., None])
+        found = np.zeros((*disparity.shape, 2))
+        for corner in np.ndindex(2, 2, 2):
+            weight = np.prod([part if one else 1 - part for one, part in zip(corner, parts, strict=True)], axis=0)
+            found += weight * self.places[(image, *(i + one for i, one in zip(whole, corner, strict=True)))]
+        reduction = self.reductions[image]
+        return (found - (reduction - 1) / 2) / reduction
+
+    def blocks(self, window: Window) -> Iterator[tuple[tuple[int, int], Window]]:
+        """Yield the blocks that a window of cells meets, and their common part, counted from the block's first cell."""
+        for row in range(window.row // BLOCK, -(-window.row_stop // BLOCK)):
+            for column in range(window.column // BLOCK, -(-window.column_stop // BLOCK)):
+                block = Window(row * BLOCK, column * BLOCK, BLOCK, BLOCK)
+                yield (row, column), block.clipped(window).relative_to(block)
+
+    def windows(self, window: Window, minimum: int, maximum: int) -> tuple[Window, ...]:
+        """Return the window of each image that the costs of a window of cells over some disparities need."""
+        blocks, ends = [block for block, _ in self.blocks(window)], np.array([minimum, maximum], float)
+        found = []
+        for image, reduction in enumerate(self.reductions):
+            places = np.array([self.corners(image, block, ends) for block in (blocks[0], blocks[-1])])
+            of_row = np.array([self.corners(image, (blocks[0][0], blocks[-1][1]), ends)])
+            of_column = np.array([self.corners(image, (blocks[-1][0], blocks[0][1]), ends)])
+            places = np.concatenate([places, of_row, of_column]).reshape(-1, 2)
+            cell = np.abs(np.diff(places.reshape(-1, 2, 2, 2), axis=1)).max() / BLOCK
+            margin = 1 + AFTER + int(np.ceil(cell * 2 * (_AROUND + _NODES)))
+            least, most = np.floor(places.min(axis=0)) - margin, np.ceil(places.max(axis=0)) + margin
+            (row, column), (height, width) = (reduction * part.astype(int) for part in (least, most - least))
+            found.append(Window(int(row), int(column), int(height), int(width)))
+        return tuple(found)
+
+    def costs(
+        self, images: Sequence[View], block: tuple[int, int], part: Window, disparities: np.ndarray, config: Config
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return costs of a part of a block at disparities, and which images see its cells, see `kernels.sweep`.
+
+        ``images`` are reduced, see `usable`. ``disparities`` are those of the whole block.
+        """
+        middle = disparities.size // 2
+        moves, planes, sizes = np.empty((disparities.size, len(images), 2)), [], []
+        for n, view in enumerate(images):
+            corners = self.corners(n, block, disparities)
+            there = corners[middle]
+            cell = np.stack([there[1].mean(axis=0) - there[0].mean(axis=0), there[:, 1].mean(0) - there[:, 0].mean(0)])
+            away = (corners.mean(axis=(1, 2)) - there.mean(axis=(0, 1))) @ np.linalg.inv(cell / BLOCK)
+            low = np.floor(away.min(axis=0)).astype(int) - _AROUND
+            high = np.ceil(away.max(axis=0)).astype(int) + _AROUND
+            first = low + np.array([part.row, part.column])
+            size = high - low + np.array([part.height, part.width])
+            begin = low // _NODES * _NODES
+            planes.append(planes_of(_fine(view, _nodes(there, begin, high + BLOCK), first, begin, size)).ravel())
+            sizes.append(size)
+            moves[:, n] = FINE * (away - low - RADIUS)
+        starts = np.cumsum([0, *(plane.size for plane in planes[:-1])])
+        costs = np.empty((part.height, part.width, disparities.size), np.uint8)
+        seen = np.empty((len(images), part.height, part.width), np.uint8)
+        assert isinstance(config.cost, Sweep)
+        share, steps = float(config.cost.share), int(config.numbers.steps)
+        sweep(np.concatenate(planes), starts, np.array(sizes), moves, self.pairs, share, steps, costs, seen)
+        return costs, seen
+
+    def count(self, seen: np.ndarray) -> np.ndarray:
+        """Return how many images see each cell, 0 where no pair to compare does."""
+        compared = (seen[self.pairs[:, 0]] & seen[self.pairs[:, 1]]).any(axis=0)
+        return np.where(compared, seen.sum(axis=0), 0).astype(np.uint8)
+
+    def usable(self, views: Views) -> list[View]:
+        """Return the reduced images, float32, with NaN where not usable; their windows count reduced pixels."""
+        found = []
+        for view, reduction in zip(views, self.reductions, strict=True):
+            window = view.window
+            pixels = np.where(view.state == 0, view.pixels, np.nan).astype(np.float32)
+            pixels = pixels.reshape(window.height // reduction, reduction, -1, reduction).mean(axis=(1, 3))
+            place = Window(window.row // reduction, window.column // reduction, *pixels.shape)
+            found.append(View(place, pixels, view.state))
+        return found
+
+
+def _nodes(there: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return positions at nodes of the fine grid, bilinear between (and beyond) the corners of a block.
+
+    ``begin`` and ``end`` count cells from the block's first: rows and columns.
+    """
+    rows, columns = (
+        (np.arange(first, last + 2 * _NODES, _NODES) + 0.5)[:, None] / BLOCK
+        for first, last in zip(begin, end, strict=True)
+    )
+    sides = there[0] + rows[:, None] * (there[1] - there[0])
+    return np.ascontiguousarray(sides[:, :1] + columns * (sides[:, 1:] - sides[:, :1]))
+
+
+def _fine(view: View, nodes: np.ndarray, first: np.ndarray, begin: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Return an image on the fine grid: ``size`` cells from ``first`` on; NaN where not usable."""
+    start = FINE * (first - begin)
+    ends = (start + FINE * size - 1) // (FINE * _NODES) + 2
+    used = nodes[tuple(slice(s, e) for s, e in zip(start // (FINE * _NODES), ends, strict=True))].reshape(-1, 2)
+    around = Window.around(used.min(axis=0) - BEFORE, used.max(axis=0) + AFTER + 1)
+    pixels = np.full((around.height, around.width), np.float32(np.nan))
+    inside = around.clipped(view.window)
+    if not (inside.height and inside.width):
+        return np.full(FINE * size, np.float32(np.nan))
+    pixels[inside.relative_to(around).slices] = view.pixels[inside.relative_to(view.window).slices]
+    return np.asarray(
+        resample(
+            pixels, (around.row, around.column), nodes, FINE * _NODES, tuple(map(int, start)), *map(int, FINE * size)
+        )
+    )
+
+
+def ground_of(report: dict[str, Any], arrays: Sequence[np.ndarray]) -> GroundViews:
+    """Return the views of a report and arrays, see `report_of_ground`."""
+    return GroundViews(
+        arrays[0], pairs=arrays[1], **report | {name: tuple(report[name]) for name in ("reductions", "shape")}
+    )
+
+
+def report_of_ground(ground: GroundViews) -> tuple[dict[str, Any], tuple[np.ndarray, np.ndarray]]:
+    """Return what identifies views: a mapping for JSON, and arrays."""
+    names = "lowest", "spacing", "reductions", "base", "step", "shape"
+    return {name: getattr(ground, name) for name in names}, (ground.places, ground.pairs)
