@@ -75,3 +75,29 @@ def low_confidence(confidence, threshold, kernel):
         for c in range(columns):
             low[r, c] &= not np.isnan(confidence[r, c])
     return low
+
+
+@cached
+def rough(winner, kept, size, least):
+    """Pixels in whose window the winners of kept pixels differ by ``least`` or more.
+
+    winner, kept: ``(rows, columns)`` int16, and bool. size: side of the square window, odd.
+    Returns ``(rows, columns)`` bool.
+    """
+    rows, columns = winner.shape
+    radius = size // 2
+    lowest, highest = np.empty(columns + 2 * radius, np.int16), np.empty(columns + 2 * radius, np.int16)
+    found = np.zeros((rows, columns), np.bool_)
+    for r in range(rows):
+        lowest[:], highest[:] = 32767, -32768
+        for i in range(max(0, r - radius), min(rows, r + radius + 1)):
+            for c in range(columns):
+                if kept[i, c]:
+                    lowest[c + radius] = min(lowest[c + radius], winner[i, c])
+                    highest[c + radius] = max(highest[c + radius], winner[i, c])
+        for c in range(columns):
+            low, high = 32767, -32768
+            for j in range(size):
+                low, high = min(low, lowest[c + j]), max(high, highest[c + j])
+            found[r, c] = high - low >= least
+    return found

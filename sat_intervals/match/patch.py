@@ -169,6 +169,8 @@ def match_patch(
     _mark_ends(raw, flat, config.disparity)
     if ranges:
         _reject_ends(raw, *ranges.at(output), config.disparity)
+    if ranges and not config.cost.compares_two:
+        _count_inside(raw, *ranges.at(output), config)
     if config.matches_right_view:
         search = config.disparity
         reach = mirrored_frame(frame, config).core if is_exact else facing(core, search.minimum, search.maximum)
@@ -202,6 +204,18 @@ def _reject_ends(raw: Raw, least: np.ndarray, most: np.ndarray, search: Disparit
     ends |= (raw.winner >= most - 1) & (most < search.maximum)
     ends &= raw.winner != NO_DISPARITY
     raw.validity[ends] |= MISMATCH
+
+
+def _count_inside(raw: Raw, least: np.ndarray, most: np.ndarray, config: Config) -> None:
+    """Count ambiguous candidates of the cell's range only, as if the whole range had such a share of them.
+
+    Kernels count those outside it as ambiguous. On many images this ranks errors better than a search of the whole
+    range: the mean error of the surest .9 falls from 1.02 to .89 m on ten images of a city (docs/many.md).
+    """
+    count = most.astype(np.int64) - least + 1
+    levels, whole = len(config.ambiguity_levels or ()), config.disparity.count
+    inside = np.maximum(raw.ambiguity.astype(np.int64) - levels * (whole - count), 0)
+    raw.ambiguity[...] = np.where(raw.winner == NO_DISPARITY, 0, inside * whole // count)
 
 
 def mirrored_settings(settings: Settings) -> Settings:

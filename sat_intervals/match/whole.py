@@ -42,7 +42,7 @@ def scale_of_rows(rows: RawRows, config: Config) -> ConfidenceScale:
     if config.ambiguity is None:
         return ConfidenceScale(np.nan, np.nan)
     histogram = ambiguity_histogram(rows.ambiguity, rows.winner != NO_DISPARITY, config.largest_ambiguity)
-    return confidence_scale(config.ambiguity, histogram)
+    return confidence_scale(config.ambiguity, histogram, config.cost.rejected)
 
 
 def finish_whole(rows: RawRows, config: Config) -> Bands:
