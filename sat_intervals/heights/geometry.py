@@ -66,6 +66,7 @@ def set_geometry(
     which the left grid reaches beyond the left image, and the ``grid_step`` in pixels.
     """
     run = out if isinstance(out, Run) else open_run(out)
+    run.check_pair()
     paths = [Path(file) for file in (left_model, right_model, left_grid, right_grid)]
     run.check_kept([run.out / FILE], paths)
     _, report = _sensors(run, paths)
@@ -79,6 +80,7 @@ def geometry_of(run: Run, progress: Progress = lambda stage, done, total: None) 
     """Return the geometry of a run, first set if `rectify` made its pair; raise without one, or if files changed."""
     from sat_intervals.heights.sensors import lattice_of
 
+    run.check_pair()
     images = [run.report["inputs"][side] for side in ("left", "right")]
     if not (run.out / FILE).exists() and (made := rectified_files(*(image["path"] for image in images))):
         for image in images:

@@ -7,7 +7,20 @@ from math import nan
 
 from rasterio.io import DatasetWriter
 
-from sat_intervals.products import BANDS, FLAGS, INVALID, POINTS, RANGES, SURFACE, TRUTH, Band, interval_bands
+from sat_intervals.products import (
+    BANDS,
+    FLAGS,
+    FLAGS_OF_SWEEP,
+    INVALID,
+    POINTS,
+    RANGES,
+    SURFACE,
+    SURFACE_OF_SWEEP,
+    TRUTH,
+    Band,
+    Flag,
+    interval_bands,
+)
 
 
 @dataclass(frozen=True)
@@ -38,19 +51,25 @@ class File:
         dataset.update_tags(1, **self.tags)
 
 
-# The meaning of every bit, such as ``bit_08 = occlusion (invalid): rejected by cross-checking: occlusion``.
-_FLAG_TAGS = {
-    f"bit_{flag.bit:02}": f"{flag.name}{' (invalid)' if flag.invalid else ''}: {flag.meaning}" for flag in FLAGS
-}
+def _flag_tags(flags: tuple[Flag, ...]) -> dict[str, str]:
+    """Return the meaning of every bit: ``bit_08 = occlusion (invalid): rejected by cross-checking: occlusion``."""
+    return {
+        f"bit_{flag.bit:02}": f"{flag.name}{' (invalid)' if flag.invalid else ''}: {flag.meaning}" for flag in flags
+    }
+
+
 _VALIDITY = Band("validity", "", f"sum of bits; a pixel is valid where (validity & {INVALID}) == 0")
 
 INTERVALS = File("intervals.tif", "float32", nan, BANDS)
-VALIDITY = File("validity.tif", "uint16", None, (_VALIDITY,), _FLAG_TAGS)
+VALIDITY = File("validity.tif", "uint16", None, (_VALIDITY,), _flag_tags(FLAGS))
 RUN_FILES = (INTERVALS, VALIDITY)
 
 
-def run_files(compression: str, extra: Collection[str] = ()) -> tuple[File, File]:
+def run_files(compression: str, extra: Collection[str] = (), *, of_heights: bool = False) -> tuple[File, File]:
     """Return the files of a run with the compression of the settings, and with extra bands, see `interval_bands`."""
+    if of_heights:
+        surface = replace(surface_file("dsm.tif"), compression=compression, bands=SURFACE_OF_SWEEP)
+        return surface, replace(VALIDITY, compression=compression, tags=_flag_tags(FLAGS_OF_SWEEP))
     intervals = replace(INTERVALS, compression=compression, bands=interval_bands(extra))
     return intervals, replace(VALIDITY, compression=compression)
 

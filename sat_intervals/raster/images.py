@@ -3,8 +3,9 @@
 import logging
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -108,6 +109,17 @@ def open_image(
             sizes = f"{shape[0]} x {shape[1]} pixels, {name} {image.height} x {image.width}"
             raise InputError(f"{mask} has {sizes}: give a mask of the image's size")
     return image
+
+
+def acquired(path: str) -> datetime | None:
+    """Return when an image was taken, by its tags; None without."""
+    with opened(path) as dataset:
+        tags = dataset.tags() | dataset.tags(ns="IMAGERY")
+    for name in ("ACQUISITIONDATETIME", "NITF_IDATIM", "TIFFTAG_DATETIME"):
+        digits = "".join(filter(str.isdigit, tags.get(name, "")))[:8]
+        with suppress(ValueError):
+            return datetime.strptime(digits, "%Y%m%d")
+    return None
 
 
 def describe(image: Image, known: Mapping[str, Mapping[str, Any]] | None = None) -> dict[str, Any]:

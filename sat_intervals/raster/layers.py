@@ -36,11 +36,15 @@ def write_layer(
     nodata: float,
     georeferencing: Georeferencing,
     tags: Mapping[str, str] = MappingProxyType({}),
+    **options: Any,
 ) -> None:
-    """Write ``(rows, columns)`` as a tiled, compressed GeoTIFF of one band; replaces an existing file."""
+    """Write ``(rows, columns)`` as a tiled, compressed GeoTIFF of one band; replaces an existing file.
+
+    ``options`` are further ones of rasterio, such as ``rpcs``.
+    """
     height, width = pixels.shape
     kind = {"count": 1, "height": height, "width": width, "dtype": pixels.dtype.name, "nodata": nodata}
-    kind |= {"tiled": True, "compress": "deflate", **georeferencing.creation_options()}
+    kind |= {"tiled": True, "compress": "deflate", **georeferencing.creation_options(), **options}
     # made in memory: GDAL closes a file without an error when the disk is full
     with new_file(path) as temporary, Env(), MemoryFile() as memory:
         with gdal.create(memory.name, **kind) as dataset:

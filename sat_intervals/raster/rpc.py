@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from rasterio import Env
+from rasterio.rpc import RPC
 
 from sat_intervals.raster import gdal
 from sat_intervals.raster.identity import in_zip
@@ -17,6 +18,8 @@ _BESIDE = ".rpb", "_rpc.txt"  # what GDAL reads beside an image only, and what s
 # Names in the order of files without names, after two errors in some.
 _SINGLE = [f"{axis}_{what}" for what in ("OFF", "SCALE") for axis in ("LINE", "SAMP", "LAT", "LONG", "HEIGHT")]
 _LISTS = [f"{axis}_{part}_COEFF_{i}" for axis in ("LINE", "SAMP") for part in ("NUM", "DEN") for i in range(1, 21)]
+# Powers of longitude, latitude and height in the terms of an RPC, up to the second order; the others are 0.
+_TERMS = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (1, 0, 1), (0, 1, 1), (2, 0, 0), (0, 2, 0), (0, 0, 2))
 
 
 def find_model(image: str) -> str | None:
@@ -62,3 +65,22 @@ def read_rpc_file(path: str) -> dict[str, Any] | None:
     if found is None:
         raise ValueError("GDAL finds no RPC in it")
     return dict(found.to_dict())
+
+
+def fitted_rpc(ground: np.ndarray, places: np.ndarray) -> RPC:
+    """Return an RPC model of the second order, fitted by least squares.
+
+    ground: ``(n, 3)`` longitude, latitude (degrees) and height (metres) of points all over an image.
+    places: ``(n, 2)`` their rows and columns, whose pixel centres are integers.
+    """
+    offset, scale = ground.mean(axis=0), np.maximum(np.ptp(ground, axis=0) / 2, 1e-6)
+    terms = (((ground - offset) / scale)[:, np.newaxis, :] ** np.array(_TERMS)).prod(axis=2)
+    middle, half = places.mean(axis=0), np.ptp(places, axis=0) / 2
+    fitted = np.zeros((20, 2))
+    fitted[: len(_TERMS)] = np.linalg.lstsq(terms, (places - middle) / half, rcond=None)[0]
+    one, figures = np.eye(20)[0].tolist(), dict[str, float]()
+    names = "long", "lat", "height", "line", "samp"
+    for name, off, by in zip(names, (*offset, *middle), (*scale, *half), strict=True):
+        figures |= {f"{name}_off": float(off), f"{name}_scale": float(by)}
+    line, sample = fitted.T.tolist()
+    return RPC(**figures, line_num_coeff=line, samp_num_coeff=sample, line_den_coeff=one, samp_den_coeff=one)

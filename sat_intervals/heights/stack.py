@@ -1,0 +1,259 @@
+"""Match many images coarsely: a surface of a level, the ranges of the next one, and shifts of the images."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.ndimage import maximum_filter, minimum_filter, shift, uniform_filter
+
+from sat_intervals.config import Config
+from sat_intervals.kernels.disparity import median
+from sat_intervals.kernels.resampling import resample
+from sat_intervals.kernels.row_offsets import AFTER, BEFORE
+from sat_intervals.match.ground import BLOCK, GroundViews
+from sat_intervals.match.local_ranges import LocalRanges
+from sat_intervals.match.matching_cost import Given
+from sat_intervals.match.patch import PatchFrame, match_patch, patch_areas
+from sat_intervals.match.sweep import SweepCost
+from sat_intervals.prepare.pair import Each
+from sat_intervals.raster import Image, read_views
+from sat_intervals.tiling import Grid, View, Window
+
+# Cells of a tile of a level, and around it that support it.
+_TILE, _OVERLAP = 256, 16
+# Share of the cells of a level, of lowest confidence, that neither ranges nor shifts are made of.
+_UNSURE = 0.1, 0.3
+# Cells of a level around a block of the next one that its range is made of, and the margin of the range: steps of the
+# level, and a share of the range.
+_BESIDE, _MARGIN = 4, (2, 0.1)
+# Sample blocks for shifts along each side of the grid, and their side in cells.
+_SAMPLES, _SIDE = 3, 96
+# Cells over which grey values are made alike.
+_LOCAL = 9
+# Side in cells of the windows, and the most steps of height between their cells, that shifts are found in.
+_FLAT = 7, 2.0
+# Steps of least squares, and pixels of a step that are enough.
+_STEPS, _ENOUGH = 8, 0.01
+# Reduction from which a level is coarse, and pixels of such a level that a shift has at least to be believed.
+_COARSE, _TOLD = 4, 0.5
+
+
+@dataclass(frozen=True)
+class Stack:
+    """Many images and where they show the cells of a level; picklable."""
+
+    images: tuple[Image, ...]
+    ground: GroundViews
+    config: Config
+    ranges: LocalRanges | None
+
+    @property
+    def whole(self) -> Window:
+        """Return all cells."""
+        return Window(0, 0, *self.ground.shape)
+
+
+class Surface(NamedTuple):
+    """Winners of cells: float32 disparities ``(rows, columns)``, NaN for none; ambiguities, shares of the largest."""
+
+    disparity: np.ndarray
+    ambiguity: np.ndarray
+
+    def sure(self, share: float) -> np.ndarray:
+        """Return the cells but a share of those with the largest ambiguity."""
+        known = np.isfinite(self.disparity)
+        most = np.quantile(self.ambiguity[known], 1 - share) if known.any() else 0.0
+        return np.asarray(known & (self.ambiguity <= most))
+
+
+def level_config(config: Config, minimum: int, maximum: int) -> Config:
+    """Return the settings of a level: winners and their ambiguities only."""
+    changes = {"minimum": minimum, "maximum": maximum}
+    return config.model_copy(
+        update={
+            "disparity": config.disparity.model_copy(update=changes),
+            "tiles": config.tiles.model_copy(update={"size": _TILE, "overlap": _OVERLAP}),
+            "interval": None,
+            "regularization": None,
+        }
+    )
+
+
+def match_core(stack: Stack, core: Window) -> Surface:
+    """Match the cells of a core with an overlap; runs on a worker."""
+    return _matched(stack, core)[0]
+
+
+def _matched(stack: Stack, core: Window) -> tuple[Surface, list[View]]:
+    frame = PatchFrame(core, stack.whole, stack.whole)
+    cost = SweepCost(stack.config, Given(ground=stack.ground, ranges=stack.ranges))
+    areas = patch_areas(frame, stack.config, stack.ranges)
+    views = read_views(stack.images, cost.windows(areas))
+    patch = match_patch(frame, cost.of_areas(views, areas), stack.config, ranges=stack.ranges)
+    inner = core.relative_to(patch.output).slices
+    disparity, ambiguity = patch.raw.disparity[inner], patch.raw.ambiguity[inner]
+    surface = Surface(disparity, (ambiguity / stack.config.largest_ambiguity).astype(np.float32))
+    return surface, stack.ground.usable(views)
+
+
+def surface_of(stack: Stack, each: Each) -> Surface:
+    """Match all cells of a level."""
+    cores = [tile.core for tile in Grid(stack.whole, _TILE)]
+    surface = Surface(*(np.full(stack.ground.shape, np.float32(np.nan)) for _ in Surface._fields))
+    for i, found in each(match_core, [(stack, core) for core in cores], "heights"):
+        for target, part in zip(surface, found, strict=True):
+            target[cores[i].slices] = part
+    return surface
+
+
+def ranges_for(surface: Surface, stack: Stack, finer: Stack, factor: int) -> LocalRanges:
+    """Return the ranges of blocks of a level ``factor`` times as fine, whose grid begins at the same corner."""
+    sure = surface.sure(_UNSURE[0])
+    disparity = median(surface.disparity, sure, 3)
+    rows, columns = (-(-size // BLOCK) for size in finer.ground.shape)
+    least, most = np.full((2, rows, columns), np.nan)
+    side = BLOCK // factor
+    for row in range(rows):
+        for column in range(columns):
+            around = Window(row * side, column * side, side, side).grown(_BESIDE, _BESIDE).clipped(stack.whole)
+            here = disparity[around.slices][sure[around.slices]]
+            if here.size:
+                least[row, column], most[row, column] = here.min(), here.max()
+    margin = _MARGIN[0] + _MARGIN[1] * (most - least)
+    search, there, ground = finer.config.disparity, finer.ground, stack.ground
+    least, most = (
+        (ground.base - there.base + ground.step * end) / there.step for end in (least - margin, most + margin)
+    )
+    least, most = np.where(np.isnan(least), search.minimum, least), np.where(np.isnan(most), search.maximum, most)
+    whole = (np.clip(end, search.minimum, search.maximum).astype(np.int16) for end in (np.floor(least), np.ceil(most)))
+    first, last = whole
+    return LocalRanges(first, last, BLOCK, BLOCK).clipped(search.minimum, search.maximum)
+
+
+def sample_cores(whole: Window) -> list[Window]:
+    """Return blocks spread over a grid."""
+    starts = [
+        sorted({round(first) for first in np.linspace(0, max(0, size - _SIDE), min(_SAMPLES, -(-size // _SIDE)))})
+        for size in (whole.height, whole.width)
+    ]
+    return [Window(row, column, _SIDE, _SIDE).clipped(whole) for row in starts[0] for column in starts[1]]
+
+
+class Sample(NamedTuple):
+    """Images resampled to the surface of a core.
+
+    alike: ``(images, rows, columns)`` float32: grey values made alike, NaN where not usable.
+    sure: bool ``(rows, columns)``.
+    cell: ``(images, 2, 2)``: how rows and columns in an image change along rows and columns of cells.
+    """
+
+    alike: np.ndarray
+    sure: np.ndarray
+    cell: np.ndarray
+
+
+def sample(stack: Stack, core: Window) -> Sample:
+    """Match a core, and resample the images to its surface; runs on a worker."""
+    surface, views = _matched(stack, core)
+    disparity = np.nan_to_num(median(surface.disparity, np.isfinite(surface.disparity), 3))
+    found = [ortho(stack.ground, n, view, core, disparity) for n, view in enumerate(views)]
+    alike, cell = (np.stack(part) for part in zip(*((_alike(values), cell) for values, cell in found), strict=True))
+    smooth = maximum_filter(disparity, _FLAT[0]) - minimum_filter(disparity, _FLAT[0]) <= _FLAT[1]
+    return Sample(alike.astype(np.float32), surface.sure(_UNSURE[1]) & smooth, cell)
+
+
+def samples_of(stack: Stack, each: Each) -> list[Sample]:
+    """Match sample blocks, and resample the images to them."""
+    cores = sample_cores(stack.whole)
+    found = dict(each(sample, [(stack, core) for core in cores], "shifts"))
+    return [found[i] for i in range(len(cores))]
+
+
+def aligned(stack: Stack, samples: Sequence[Sample]) -> tuple[np.ndarray, np.ndarray]:
+    """Return shifts ``(images, 2)`` that add to positions, pixels with mean 0, and correlations with the other images.
+
+    Least squares between each image and the median of the others on sample blocks of the surface. A shift for each
+    image is what Fraser and Hanley (2003) found that RPC models need.
+    """
+    shifts = np.zeros((len(stack.images), 2))
+    for _ in range(_STEPS):
+        sums = np.sum([_equations(one, shifts) for one in samples], axis=0)
+        step = np.zeros_like(shifts)
+        solvable = np.linalg.det(sums[:, :, :2]) > 0
+        step[solvable] = np.linalg.solve(sums[solvable, :, :2], sums[solvable, :, 2:])[..., 0]
+        shifts += step - step.mean(axis=0)
+        if np.abs(step).max() <= _ENOUGH:
+            break
+    reduction = np.array(stack.ground.reductions)[:, None]
+    is_fine = np.linalg.norm(shifts, axis=1, keepdims=True) >= _TOLD * (reduction >= _COARSE)
+    shifts = np.where(is_fine, shifts, 0.0) * reduction
+    return shifts - shifts.mean(axis=0), _correlations(samples)
+
+
+def _correlations(samples: Sequence[Sample]) -> np.ndarray:
+    products = []
+    for one in samples:
+        for n, own in enumerate(one.alike):
+            middle = median_of(np.delete(one.alike, n, axis=0))
+            seen = one.sure & np.isfinite(own) & np.isfinite(middle)
+            products.append((n, (own * middle)[seen].sum(), (own**2)[seen].sum(), (middle**2)[seen].sum()))
+    sums = np.zeros((len(samples[0].alike), 3))
+    for n, *parts in products:
+        sums[n] += parts
+    return np.asarray(sums[:, 0] / np.sqrt(np.maximum(sums[:, 1] * sums[:, 2], 1e-9)))
+
+
+def _equations(one: Sample, shifts: np.ndarray) -> np.ndarray:
+    """Return the normal equations of a step beyond shifts (reduced pixels), ``(images, 2, 3)``."""
+    to_cells = np.linalg.inv(one.cell)
+    moved = np.stack(
+        [
+            shift(values, -cells @ by, order=1, cval=np.nan)
+            for values, cells, by in zip(one.alike, to_cells, shifts, strict=True)
+        ]
+    )
+    result = np.zeros((len(moved), 2, 3))
+    for n, own in enumerate(moved):
+        middle = median_of(np.delete(moved, n, axis=0))
+        along = np.stack(np.gradient(middle), axis=-1)
+        seen = one.sure & np.isfinite(own) & np.isfinite(along).all(axis=-1)
+        slope, miss = along[seen] @ to_cells[n], (middle - own)[seen]
+        weighted = slope / (1 + miss**2)[:, None]
+        result[n, :, :2], result[n, :, 2] = weighted.T @ slope, weighted.T @ miss
+    return result
+
+
+def ortho(
+    ground: GroundViews, image: int, view: View, core: Window, disparity: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return an image resampled to the surface of a core, and how positions (pixels) change along cells, ``(2, 2)``."""
+    places = ground.positions(image, core, disparity)
+    cell = np.stack(
+        [np.diff(places, axis=axis).mean(axis=(0, 1)) for axis in (0, 1)], axis=-1
+    )  # [pixel axis, cell axis]
+    nodes = np.pad(places, ((0, 1), (0, 1), (0, 0)), mode="edge")
+    around = Window.around(places.min(axis=(0, 1)) - BEFORE, places.max(axis=(0, 1)) + AFTER + 1)
+    pixels = np.full((around.height, around.width), np.float32(np.nan))
+    inside = around.clipped(view.window)
+    if inside.height and inside.width:
+        pixels[inside.relative_to(around).slices] = view.pixels[inside.relative_to(view.window).slices]
+    return resample(pixels, (around.row, around.column), nodes, 1, (0, 0), *disparity.shape), cell
+
+
+def _alike(values: np.ndarray) -> np.ndarray:
+    """Return grey values without their local mean, over their local deviation; NaN near NaN."""
+    usable = np.isfinite(values)
+    filled = np.where(usable, values, 0).astype(np.float64)
+    share = np.maximum(uniform_filter(usable.astype(float), _LOCAL), 1e-9)
+    away = np.where(usable, filled - uniform_filter(filled, _LOCAL) / share, 0.0)
+    deviation = np.sqrt(np.maximum(uniform_filter(away**2, _LOCAL) / share, 0))
+    scale = deviation + 0.05 * (deviation[usable].mean() if usable.any() else 1.0) + 1e-9
+    return np.where(usable, away / scale, np.nan)
+
+
+def median_of(values: np.ndarray) -> np.ndarray:
+    """Return the median along the first axis, without NaN; much faster than `numpy.nanmedian`."""
+    ordered, count = np.sort(values, axis=0), np.isfinite(values).sum(axis=0)
+    low, high = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, len(values) - 1)
+    return np.asarray(np.take_along_axis(ordered, np.stack([low, high]), axis=0).mean(axis=0))
