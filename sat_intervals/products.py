@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike, fspath
 from typing import Any, NamedTuple
 
@@ -66,6 +66,20 @@ FLAGS = (
 ) = (flag.value for flag in FLAGS)  # fmt: skip
 REJECTED = OCCLUSION | MISMATCH
 INVALID = sum(flag.value for flag in FLAGS if flag.invalid)
+
+# Where many images are compared at heights, some have another meaning.
+_MEANINGS_OF_SWEEP = {
+    LEFT_WINDOW: "fewer than two images see the cell",
+    NO_CANDIDATE: "no height could be compared",
+    RANGE_INCOMPLETE: "part of the heights could not be compared",
+    NOT_REFINED: "height without refinement between steps",
+    **dict.fromkeys((LEFT_MASKED, RIGHT_MASKED, OCCLUSION), "not used: of pairs only"),
+    RANGE_END: "best height at an end of those searched, or next to it",
+    OPEN_BELOW: "interval open below: the height may be below those searched",
+    OPEN_ABOVE: "interval open above: the height may be above those searched",
+    MISMATCH: "at an end of the heights searched around it, or of the lowest confidence",
+}
+FLAGS_OF_SWEEP = tuple(replace(flag, meaning=_MEANINGS_OF_SWEEP.get(flag.value, flag.meaning)) for flag in FLAGS)
 
 
 def flag_attributes() -> dict[str, object]:
@@ -174,6 +188,15 @@ SURFACE = (
     Band("confidence", "", "mean of their confidences, 0 to 1, high = easy to match"),
     Band("agreement", "", "1 where the intervals of several pairs meet, 0 where they do not; no data for one pair"),
 )
+
+# The same of many images that were compared at heights.
+_OF_SWEEP = {
+    "height": "height at which the images are most alike",
+    "count": "images that see the cell",
+    "confidence": BANDS[3].meaning,
+    "agreement": "no data",
+}
+SURFACE_OF_SWEEP = tuple(replace(band, meaning=_OF_SWEEP.get(band.name, band.meaning)) for band in SURFACE)
 
 
 def plain(content: Any) -> Any:

@@ -2,10 +2,10 @@
 
 import json
 import logging
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from sat_intervals.config import Config, Regularization, load_config
 from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.kernels.row_offsets import RowOffsets
-from sat_intervals.products import BANDS, Bands
+from sat_intervals.products import BANDS, REGULARIZED, Bands
 from sat_intervals.raster import Georeferencing, Image, check_not_replaced, open_image, read_layers, read_tags
 from sat_intervals.raster.identity import absolute_in, identities
 from sat_intervals.raster.images import opened
@@ -23,7 +23,9 @@ from sat_intervals.tiling import Window, strips
 
 # Pixels in a strip, and band count of each file.
 _STRIP = 1 << 23
-_BANDS = {"intervals.tif": len(BANDS), "validity.tif": 1}
+_BANDS = {"intervals.tif": range(len(BANDS)), "validity.tif": range(1)}
+# Of a sweep of many images: height, lower and upper bound, confidence.
+_BANDS_OF_SWEEP = {"dsm.tif": (0, 1, 2, 4), "validity.tif": range(1)}
 # Files that later commands add to a run: the command, and whether a file is of the run that finished at a time.
 _ADDED: dict[str, tuple[str, Callable[[Path, str], bool]]] = {
     "dsm.tif": ("dsm", is_surface_of),
@@ -32,6 +34,17 @@ _ADDED: dict[str, tuple[str, Callable[[Path, str], bool]]] = {
 }
 
 _LOG = logging.getLogger(__name__)
+
+
+class Quantity(NamedTuple):
+    """What the bands of a run are: names, unit, units in a step of the search, lowest and highest searched."""
+
+    name: str
+    plural: str
+    unit: str
+    step: float
+    minimum: float
+    maximum: float
 
 
 @dataclass(frozen=True)
@@ -43,6 +56,39 @@ class Run:
     config: Config
     region: Window
     georeferencing: Georeferencing
+
+    @property
+    def bands(self) -> Mapping[str, Sequence[int]]:
+        """Return the files of the run with the indices of the bands of `Bands`."""
+        return _BANDS_OF_SWEEP if self.is_sweep else _BANDS
+
+    @property
+    def is_sweep(self) -> bool:
+        """Return whether the run compared many images at heights: it has no disparities and no left image."""
+        return not self.config.cost.compares_two
+
+    @property
+    def quantity(self) -> Quantity:
+        """Return what the bands are: heights in metres of a sweep, else disparities in pixels."""
+        if self.is_sweep:
+            swept = self.report["sweep"]
+            return Quantity("height", "heights", "m", swept["step"], *swept["heights"])
+        search = self.config.disparity
+        return Quantity("disparity", "disparities", "px", 1, search.minimum, search.maximum)
+
+    @property
+    def images(self) -> dict[str, dict[str, Any]]:
+        """Return the records of the images by their titles, such as 'left image' or 'image 3'."""
+        inputs = self.report["inputs"]
+        if self.is_sweep:
+            return {name.replace("_", " "): one for name, one in inputs.items() if name.startswith("image_")}
+        return {f"{side} image": inputs[side] for side in ("left", "right")}
+
+    def check_pair(self) -> None:
+        """Raise if the run is a sweep, which has no disparities of a pair."""
+        if self.is_sweep:
+            many = f"the surface of {len(self.images)} images, without disparities of a pair"
+            raise SatIntervalsError(f"{self.out} is {many}: use {self.out / 'dsm.tif'}, or give the folder of a pair")
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -66,7 +112,8 @@ class Run:
 
     def read_bands(self, window: Window) -> Bands:
         """Read the bands of a window of the results."""
-        return Bands(*(band for name, n in _BANDS.items() for band in read_layers(self.out / name, window)[:n]))
+        layers = ((read_layers(self.out / name, window), chosen) for name, chosen in self.bands.items())
+        return Bands(*(bands[i] for bands, chosen in layers for i in chosen))
 
     def windows(self) -> Iterator[Window]:
         """Yield full-width windows of the results from the top."""
@@ -74,6 +121,8 @@ class Run:
 
     def has_current(self, name: str) -> bool:
         """Return whether the folder has a file of a later command, made of this run; warn if it is of another one."""
+        if name in self.bands:
+            return True
         command, is_of = _ADDED[name]
         if not (file := self.out / name).exists() or is_of(file, self.report["finished"]):
             return file.exists()
@@ -82,7 +131,7 @@ class Run:
 
     def check_kept(self, outputs: Iterable[str | Path], inputs: Iterable[str | Path | None] = ()) -> None:
         """Raise if an output would replace a file of the run, its inputs, a given truth, or one of ``inputs``."""
-        own = [self.out / name for name in (*_BANDS, "run.json")]
+        own = [self.out / name for name in (*self.bands, "run.json")]
         grid = self.config.disparity.grid  # other rasters are inputs
         truth = self.truth_beside
         given = None if truth.exists() and "REFERENCE" in read_tags(truth) else truth  # `reference` may replace its own
@@ -127,7 +176,8 @@ class Results(Run):
 
     def read_small(self, shape: tuple[int, int]) -> Bands:
         """Read all bands, from overviews, and the left image at ``shape`` pixels; no truth."""
-        bands = Bands(*(band for name, n in _BANDS.items() for band in read_small_layers(self.out / name, shape)[:n]))
+        layers = ((read_small_layers(self.out / name, shape), chosen) for name, chosen in self.bands.items())
+        bands = Bands(*(bands[i] for bands, chosen in layers for i in chosen))
         return bands._replace(image=read_small_image(self.left, self.region, shape))
 
     def read_small_left(self, window: Window, shape: tuple[int, int]) -> np.ndarray:
@@ -138,6 +188,8 @@ class Results(Run):
     def low(self, bands: Bands) -> np.ndarray:
         """Return the mask of low-confidence pixels (paper eq. 12 and 13) of whole rows, with defaults if it was off."""
         settings = self.config.regularization or Regularization()
+        if self.is_sweep:  # rough ground is low, too
+            return np.asarray(bands.validity & REGULARIZED != 0)
         return np.asarray(low_confidence(bands.confidence, settings.threshold, settings.kernel))
 
     def check_pixel(self, row: int, column: int) -> None:
@@ -165,13 +217,17 @@ def open_run(out: str | Path) -> Run:
         region = Window(**report["tiles"]["region"])
         report["inputs"] = absolute_in(file.parent, report["inputs"])
         config = load_config(report["settings"])
+        if not config.cost.compares_two:  # its heights stand for the images of a pair
+            heights = {"path": str(file.with_name("dsm.tif")), "band": 1, "mask": None, "nodata": None}
+            size = {"height": region.height, "width": region.width}
+            report["inputs"] |= dict.fromkeys(("left", "right"), heights | size)
     except OSError as error:
         raise SatIntervalsError(f"{file}: {error.strerror}: give the folder of a finished run") from error
     except SatIntervalsError as error:
         raise SatIntervalsError(f"{file}: {error}: made by another version, match again with --overwrite") from error
     except (ValueError, LookupError, TypeError) as error:
         raise SatIntervalsError(f"{file} is not the report of a run: match again with --overwrite") from error
-    for name in _BANDS:
+    for name in _BANDS if config.cost.compares_two else _BANDS_OF_SWEEP:
         check_file(file.with_name(name), "give the folder of a finished run, or match with --overwrite")
     with opened(str(file.with_name("validity.tif"))) as dataset:
         return Run(file.parent, report, config, region, Georeferencing.of(dataset))
@@ -180,9 +236,11 @@ def open_run(out: str | Path) -> Run:
 def open_results(out: str | Path, truth: str | Path | None = None) -> Results:
     """Open a finished run, its images and its truth, by default ``truth.tif`` beside the left image if it exists."""
     run = open_run(out)
+    if truth is not None:
+        run.check_pair()
     left, right = (open_input(run.report["inputs"][side]) for side in ("left", "right"))
     right = replace(right, rows=run.rows)
-    truth = truth or (run.truth_beside if run.truth_beside.exists() else None)
+    truth = truth or (run.truth_beside if not run.is_sweep and run.truth_beside.exists() else None)
     return Results(**vars(run), left=left, right=right, truth=None if truth is None else run.layer(truth))
 
 

@@ -9,6 +9,7 @@ from sat_intervals.errors import InputError, SatIntervalsError
 from sat_intervals.kernels.row_offsets import RowOffsets
 from sat_intervals.match.around import with_hull
 from sat_intervals.match.coarse import Found, settings, with_range
+from sat_intervals.match.ground import GroundViews
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.normalization import Moments, PairStatistics, blocks, moments, statistics_of
 from sat_intervals.match.parallax import Survey, fit_rows
@@ -33,6 +34,7 @@ class Prepared(Generic[P]):
     ranges: local search ranges.
     statistics: of the whole images; None if the matching cost needs none.
     missed: see `Survey.missed`.
+    ground: where many images show the ground; None of a pair.
     """
 
     pair: P
@@ -42,7 +44,8 @@ class Prepared(Generic[P]):
     rows: RowOffsets | None
     ranges: LocalRanges | None
     statistics: PairStatistics | None
-    missed: str
+    missed: str = ""
+    ground: GroundViews | None = None
 
     def known(self) -> dict[str, Any]:
         """Return what `prepare` takes as known of the same images."""

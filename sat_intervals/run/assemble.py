@@ -50,13 +50,13 @@ def assemble(job: Job, workers: Workers, seconds: dict[str, float], progress: Pr
     files, place = files_of_run(job.config), job.left.georeferencing.shifted(region)
     with (
         _resumable(job),
-        OutputWriter(job.out, files, region.height, region.width, place, tags_of(job.config)) as writer,
+        OutputWriter(job.out, files, region.height, region.width, place, tags_of(job)) as writer,
     ):
         with logged_stage(seconds, "files"):
             _copy_parts(job, writer, parts, workers, progress)
             made = writer.build()
         with logged_stage(seconds, "inputs"):
-            check_unchanged(absolute_in(job.out, job.inputs), job.left, job.right, job.config)
+            check_unchanged(absolute_in(job.out, job.inputs), job.images, job.config)
         report = report_of(job, tables, scale, parts.values(), seconds)
         for line in report["warnings"]:
             _WARNINGS.warning("%s", line)
@@ -160,13 +160,14 @@ def scale_of(job: Job, tables: Tables) -> ConfidenceScale:
     if not tables.histogram.any():
         raise _nothing_matched(job, tables)
     nothing = ConfidenceScale(np.nan, np.nan)
-    return confidence_scale(job.config.ambiguity, tables.histogram) if job.config.ambiguity else nothing
+    if not job.config.ambiguity:
+        return nothing
+    return confidence_scale(job.config.ambiguity, tables.histogram, job.config.cost.rejected)
 
 
 def _nothing_matched(job: Job, tables: Tables) -> SatIntervalsError:
     records = tables.records.values()
-    usable = {side: sum(record["usable_pixels"][side] for record in records) for side in ("left", "right")}
-    empty = [image.path for image, side in ((job.left, "left"), (job.right, "right")) if not usable[side]]
+    empty = [image.path for side, image in job.images.items() if not any(one["usable_pixels"][side] for one in records)]
     search, window = job.config.disparity, job.config.cost.window
     reason = (
         f"all pixels of {' and '.join(empty)} are no data or masked"

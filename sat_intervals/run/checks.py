@@ -1,5 +1,6 @@
 """Check that a pair can be matched with the memory that there is, before its tiles; what it needs on disks."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 from sat_intervals.config import Config
@@ -74,7 +75,7 @@ def check_tiles(config: Config, region: Window) -> None:
     )
 
 
-def disk_bytes(grid: Grid, config: Config, images: tuple[Image, Image]) -> tuple[int, int, int]:
+def disk_bytes(grid: Grid, config: Config, images: Iterable[Image]) -> tuple[int, int, int]:
     """Return the bytes of tiles and what they hand on, of parts of files, and of the files, at most."""
     region, files = grid.region, files_of_run(config)
     tiles = store_bytes(grid, has_coverage=config.has_coverage)

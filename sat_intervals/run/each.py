@@ -31,7 +31,10 @@ class EachOnWorkers:
         return results(self.workers, tasks, failed, lambda done: self.progress(stage, done, len(arguments)))
 
 
-_FOUND = {"range": "the search range", "rows": "row offsets", "images": "mean and deviation of the images"}
+_FOUND = {"range": "the search range", "rows": "row offsets", "images": "mean and deviation of the images"} | {
+    "heights": "the heights of the ground",
+    "shifts": "the shifts of the images",
+}
 
 
 def _called(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:

@@ -12,9 +12,9 @@ from sat_intervals.raster.identity import identity
 from sat_intervals.store.manifest import differences
 
 
-def describe_inputs(left: Image, right: Image, config: Config, known: Mapping[str, Any]) -> dict[str, Any]:
+def describe_inputs(images: Mapping[str, Image], config: Config, known: Mapping[str, Any]) -> dict[str, Any]:
     """Return what identifies images and the files of the cost; see `identity` for ``known``."""
-    inputs = {"left": describe(left, known), "right": describe(right, known)}
+    inputs = {name: describe(image, known) for name, image in images.items()}
     if config.disparity.around:
         inputs["around"] = describe(open_image(config.disparity.around, band=1), known)
     for name, file in config.cost.files().items():
@@ -22,10 +22,10 @@ def describe_inputs(left: Image, right: Image, config: Config, known: Mapping[st
     return inputs
 
 
-def check_unchanged(before: Mapping[str, Any], left: Image, right: Image, config: Config) -> None:
+def check_unchanged(before: Mapping[str, Any], images: Mapping[str, Image], config: Config) -> None:
     """Raise ChangedInputError if inputs differ from their description of before; all local files are read."""
     try:
-        now = plain(describe_inputs(left, right, config, {}))
+        now = plain(describe_inputs(images, config, {}))
     except (OSError, ChangedInputError) as error:
         raise RunError(f"an input cannot be compared now: {error}; rerun the same command: it resumes") from error
     changes = list(differences(before, now))

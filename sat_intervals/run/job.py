@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cache
+from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -11,16 +12,19 @@ from typing import Any
 from sat_intervals.config import Config, load_config, resolved
 from sat_intervals.errors import RunError
 from sat_intervals.kernels import FINGERPRINT
+from sat_intervals.match.ground import GroundViews, ground_of, report_of_ground
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.matching_cost import VolumeOf
 from sat_intervals.match.schedule import blocks_of
 from sat_intervals.prepare.pair import Each, FilePair, here
 from sat_intervals.prepare.prepared import Prepared, prepare
+from sat_intervals.products import plain
 from sat_intervals.raster import Image, check_space, files_of
 from sat_intervals.raster.identity import absolute_in, check_not_replaced, identities, relative_in
 from sat_intervals.run.checks import check_tiles, checked_pair, checked_region, disk_bytes, fitted_to_jobs
 from sat_intervals.run.inputs import describe_inputs
-from sat_intervals.run.state import OUTPUTS, check_folder, next_step, read_report
+from sat_intervals.run.state import check_folder, next_step, outputs_of, read_report
+from sat_intervals.store.arrays import DamagedFileError, numbered
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import MANIFEST, PLACE, StoreError, digest, place_of, read_manifest, write_manifest
 from sat_intervals.store.tiles import LAYOUT, ONCE, PARTS, TILES, DamagedTilesError, Store, home_of
@@ -28,10 +32,26 @@ from sat_intervals.tiling import Grid, Tile, Window
 
 # Settings without effect on tiles; those of the preset itself are listed one by one.
 _NOT_OF_TILES = {"preset", "rows", "median", "regularization", "products", "cluster"}
-# File of `ONCE`.
-_RANGE = "range"
+# Files of `ONCE`.
+_RANGE, _GROUND = "range", "ground"
 _REMOTE = "check URL and credentials, and pip install the package of its file system ('sat-intervals[remote]' for S3)"
 _NO_TILES = Grid(Window(0, 0, 0, 0), 1)
+
+
+@dataclass(frozen=True)
+class Swept:
+    """What a sweep of many images has instead of a pair.
+
+    images: by the names of their records.
+    asked: digest of all that its geometry was found from.
+    level: what its heights are above, in words.
+    report: shifts and other figures, for ``run.json``.
+    """
+
+    images: dict[str, Image]
+    asked: str
+    level: str
+    report: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -41,7 +61,8 @@ class Job:
     ``prepared`` is what was found of the pair; workers read the local ranges from the store. ``manifest`` is all that
     decides the bytes of a tile, and where the tiles are. ``requested`` is the section ``disparity`` as given. With
     ``overwrite``, files and another run in ``out`` may be replaced. `calibrate` makes no files of its tiles:
-    ``has_files`` is False. ``volume_of`` makes the volumes of another matcher; its name is in the settings.
+    ``has_files`` is False. ``volume_of`` makes the volumes of another matcher; its name is in the settings. ``swept``:
+    what a sweep of many images has instead of a pair; its ``left`` is the grid of cells.
     """
 
     prepared: Prepared[FilePair]
@@ -52,6 +73,7 @@ class Job:
     overwrite: bool = False
     has_files: bool = True
     volume_of: VolumeOf | None = None
+    swept: Swept | None = None
 
     @property
     def left(self) -> Image:
@@ -62,6 +84,11 @@ class Job:
     def right(self) -> Image:
         """Return the right image, with the row offsets that are taken out of it."""
         return self.prepared.pair.right
+
+    @property
+    def images(self) -> dict[str, Image]:
+        """Return the images that tiles are matched from, by the names of their records."""
+        return self.swept.images if self.swept else {"left": self.left, "right": self.right}
 
     @property
     def config(self) -> Config:
@@ -100,7 +127,8 @@ class Job:
 
     def begin(self) -> bool:
         """Open the store and return True; False if the run is complete. Call it while the folder is locked."""
-        step = next_step(self.out, self.manifest, self.name, self.settings, overwrite=self.overwrite)
+        names = outputs_of(self.config)
+        step = next_step(self.out, self.manifest, self.name, self.settings, overwrite=self.overwrite, names=names)
         if step == "complete":
             return False
         if step == "start anew":
@@ -111,6 +139,11 @@ class Job:
                 write_manifest(home_of(self.out), self.manifest)
             ranges = self.prepared.ranges and self.prepared.ranges.report()
             self.store.write(ONCE, _RANGE, of=origin_of(self.inputs), ranges=ranges, **self.prepared.known())
+            if self.prepared.ground:
+                assert self.swept is not None
+                figures, arrays = report_of_ground(self.prepared.ground)
+                meta: dict[str, Any] = {"figures": figures, "report": self.swept.report}
+                self.store.write(ONCE, _GROUND, numbered(arrays), of=self.swept.asked, **meta)
         except OSError as error:
             remedy = "make room, check its rights or choose another folder" if self.store.folder.is_local else _REMOTE
             raise StoreError(f"{self.store.folder} cannot be used: {error.strerror or error}: {remedy}") from error
@@ -119,7 +152,7 @@ class Job:
 
     def _check_space(self) -> None:
         """Raise if disks have no room for what a run has yet to write."""
-        tiles, parts, final = disk_bytes(self.store.grid, self.config, (self.left, self.right))
+        tiles, parts, final = disk_bytes(self.store.grid, self.config, self.images.values())
         share = len(self.waiting()) / len(self.store.grid)
         before = share * tiles + max(0, self.has_files * parts - sum(self.store.folder.sizes(PARTS).values()))
         final *= self.has_files
@@ -150,9 +183,17 @@ class Job:
             )
         return LocalRanges.of_report(kept)
 
+    def ground(self) -> GroundViews | None:
+        """Return where many images show the ground; None of a pair."""
+        if self.prepared.ground or self.swept is None:
+            return self.prepared.ground
+        if kept := _read_ground(self.store, self.swept.asked):
+            return kept[0]
+        raise DamagedTilesError(f"the geometry in {self.store.folder} is missing: rerun the same command: it resumes")
+
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out what workers read from the store, see `ranges`, and evidence."""
-        return self.__dict__ | {"prepared": replace(self.prepared, ranges=None, search=None, survey=None)}
+        """Leave out what workers read from the store, see `ranges` and `ground`, and evidence."""
+        return self.__dict__ | {"prepared": replace(self.prepared, ranges=None, search=None, survey=None, ground=None)}
 
     def waiting(self) -> list[Tile]:
         """Return the tiles that are not done."""
@@ -182,7 +223,8 @@ def open_job(
     before: dict[str, Any] = {}  # manifest or report of an earlier run
     with suppress(StoreError):
         before = read_manifest(home_of(out)) or read_report(out) or {}
-    inputs = describe_inputs(*images, config, identities(absolute_in(out, before.get("inputs", {}))))
+    files = identities(absolute_in(out, before.get("inputs", {})))
+    inputs = describe_inputs(dict(zip(("left", "right"), images, strict=True)), config, files)
     known = _known(out, before, relative_in(out, inputs))
     prepared = prepare(FilePair(*images), config, each, region=window, known=known)
     return job_of(prepared, out, inputs, requested, region, overwrite=overwrite, pair=pair)
@@ -197,6 +239,7 @@ def job_of(
     *,
     overwrite: bool = False,
     pair: str = "",
+    swept: Swept | None = None,
 ) -> Job:
     """Make the job of a prepared pair in a folder; its tiles are named by ``pair`` where several share a store."""
     config = fitted_to_jobs(prepared.config)
@@ -209,9 +252,26 @@ def job_of(
     if config.cluster.store:
         folder = folder_at(f"{folder_at(config.cluster.store)}/{'-'.join(filter(None, (pair, run)))}")
     manifest[PLACE] = None if folder == folder_at(home_of(out)) else str(folder)
-    check_not_replaced(read, [out / name for name in OUTPUTS], [home_of(out)])
+    check_not_replaced(read, [out / name for name in outputs_of(config)], [home_of(out)])
     kept = Store(folder, Grid(region, config.tiles.size), run)
-    return Job(prepared, kept, out, manifest, requested, overwrite)
+    return Job(prepared, kept, out, manifest, requested, overwrite, swept=swept)
+
+
+def _read_ground(store: Store, asked: str) -> tuple[GroundViews, dict[str, Any]] | None:
+    try:
+        with store.opened(ONCE, _GROUND, asked) as archive:
+            arrays = [archive[name].copy() for name in archive.names()]
+            return ground_of(archive.meta["figures"], arrays), dict(archive.meta["report"])
+    except DamagedFileError:
+        return None
+
+
+def kept_ground(out: Path, asked: str) -> tuple[GroundViews, dict[str, Any]] | None:
+    """Return what an earlier start of the same sweep in a folder has found, and what it noted of it; None without."""
+    with suppress(StoreError):
+        if manifest := read_manifest(home_of(out)):
+            return _read_ground(Store(place_of(home_of(out), manifest), _NO_TILES, ""), asked)
+    return None
 
 
 def _known(out: Path, before: Mapping[str, Any], inputs: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -227,7 +287,7 @@ def _known(out: Path, before: Mapping[str, Any], inputs: Mapping[str, Any]) -> M
 
 def origin_of(inputs: Mapping[str, Any]) -> str:
     """Return a digest of all that decides which search range is found."""
-    images = {side: inputs[side] for side in ("left", "right")}
+    images = {name: inputs[name] for name in inputs if name in ("left", "right") or name.startswith("image_")}
     return digest({"version": _version(), "kernels": FINGERPRINT, "inputs": images})
 
 
@@ -250,6 +310,11 @@ def _made_by() -> dict[str, Any]:
     return {"version": _version(), "kernels": FINGERPRINT, "layout": LAYOUT}
 
 
+def _identity(ground: GroundViews) -> dict[str, Any]:
+    figures, arrays = report_of_ground(ground)
+    return dict(plain(figures)) | {"places": sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()}
+
+
 def _manifest(prepared: Prepared[FilePair], inputs: Mapping[str, Any], region: Window) -> dict[str, Any]:
     """Return all that decides the bytes of a tile; of a calibration only its levels."""
     config, ranges, rows = prepared.config, prepared.ranges, prepared.rows
@@ -265,6 +330,7 @@ def _manifest(prepared: Prepared[FilePair], inputs: Mapping[str, Any], region: W
     return {
         **({"local_ranges": digest(ranges.report())} if ranges else {}),
         **({"rows": asdict(rows)} if rows else {}),
+        **({"ground": _identity(prepared.ground)} if prepared.ground else {}),
         **_made_by(),
         "settings": settings,
         "inputs": inputs,

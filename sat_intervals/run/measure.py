@@ -125,7 +125,7 @@ def _of_scene(
         images = checked_pair(scene.left, scene.right, scene.config)
         each = EachOnWorkers(workers, progress)
         without_cuts = at_levels(scene.config, 0.0, 0.0, None)  # and without local ranges
-        inputs = describe_inputs(*images, without_cuts, {})
+        inputs = describe_inputs(dict(zip(("left", "right"), images, strict=True)), without_cuts, {})
         prepared = prepare(FilePair(*images), without_cuts, each, region=scene.window)
         jobs = [_begun(prepared, inputs, scene, thresholds, pair, folder / str(pair[1]), stack) for pair in pairs]
         # several tiles of one job keep all workers busy; stores of all jobs at once would fill the disk
@@ -140,7 +140,7 @@ def _of_scene(
                 gauge = gauge or _SceneGauge(job, scene, thresholds, in_blocks)
                 gauge.add(job, pairs[jobs.index(job)])
                 job.store.remove()
-        check_unchanged(jobs[0].inputs, scene.left, scene.right, jobs[0].config)
+        check_unchanged(jobs[0].inputs, jobs[0].images, jobs[0].config)
     assert gauge is not None  # there are jobs
     return gauge.gauge.measured()
 

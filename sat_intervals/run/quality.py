@@ -36,6 +36,8 @@ _ROW_OFFSET, _NOISE = 1.0, 0.55
 
 def quality_of(job: Job, tables: Tables) -> dict[str, Any]:
     """Return ``noise``; ``undeclared``, see `Found`; ``no_data``, shares by side; ``same``: of equal images."""
+    if job.swept:
+        return {"undeclared": {}, "same": False, "no_data": {}, "noise": None}
     looked = _look(job.left, job.right, job.store.grid.region) | {"no_data": _no_data(job, tables)}
     looked["undeclared"] |= job.prepared.search.undeclared if job.prepared.search else {}
     return looked | {"noise": job.prepared.survey and job.prepared.survey.noise}
@@ -104,6 +106,12 @@ def _undeclared(pixels: np.ndarray, state: np.ndarray) -> dict[str, float] | Non
 
 def warnings_of(job: Job, counts: Mapping[str, Any], quality: Mapping[str, Any]) -> list[str]:
     """Return the warnings about a run, one line each, the likeliest cause of all others first."""
+    if job.swept:
+        lines = [
+            f"{path}: left out, since it is not like the other images on the ground: clouds, or another place"
+            for path in job.swept.report["left_out"]
+        ]
+        return [*lines, *([f"{job.out}: {missed}"] if (missed := unreached(job.config)) else [])]
     paths, config, survey = (job.left.path, job.right.path), job.config, job.prepared.survey
     of_data = [*doubts_of_images(job.left, job.right, quality), *_spoiled(job, counts, quality["no_data"]["left"])]
     rows = rows_left(survey, config.rows, job.right.path)

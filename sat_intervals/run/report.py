@@ -11,8 +11,8 @@ from typing import Any
 from sat_intervals.config import Config, calibration_of
 from sat_intervals.match.postprocess import ConfidenceScale
 from sat_intervals.match.statistics import Tally
-from sat_intervals.products import FLAGS
-from sat_intervals.run.job import Job, origin_of
+from sat_intervals.products import FLAGS, FLAGS_OF_SWEEP
+from sat_intervals.run.job import Job, Swept, origin_of
 from sat_intervals.run.quality import quality_of, verdict_of, warnings_of
 from sat_intervals.store.tiles import Tables
 
@@ -26,8 +26,11 @@ _COUNTS_MEANING = {
 }
 
 
-def tags_of(config: Config) -> dict[str, str]:
+def tags_of(job: Job) -> dict[str, str]:
     """Return the tags of the output files."""
+    config = job.config
+    if job.swept:
+        return _tags_of_surface(job, job.swept)
     tags = {
         "SOFTWARE": f"sat-intervals {version('sat-intervals')}",
         "SEARCH_RANGE": f"{config.disparity.minimum} {config.disparity.maximum}",
@@ -40,6 +43,22 @@ def tags_of(config: Config) -> dict[str, str]:
     elif interval:
         tags["ALPHA"] = f"{interval.alpha} (level of possibility, not a probability)"
     return tags
+
+
+def _tags_of_surface(job: Job, swept: Swept) -> dict[str, str]:
+    """Return the tags of the surface of a sweep, see `surface_tags`; the size of tiles is not in them."""
+    interval, images = job.config.interval, len(job.images)
+    tags = {
+        "SOFTWARE": f"sat-intervals {version('sat-intervals')}",
+        "RUNS": swept.asked,
+        "HEIGHTS": f"above {swept.level}",
+    }
+    tags |= {"IMAGES": f"{images}", "INTERVAL": "cost curve of many images"}
+    if interval and interval.coverage is not None:
+        calibration = calibration_of(job.config)
+        name = f"{calibration.name} {calibration.sha256}"
+        return tags | {"COVERAGE": str(interval.coverage), "DISPARITY_CALIBRATION": name}
+    return tags | ({"ALPHA": str(interval.alpha)} if interval else {})
 
 
 @cache
@@ -66,6 +85,7 @@ def report_of(
     tally = Tally(config.disparity.count, config.disparity.minimum)
     for part in parts:
         tally.merge(part.get("counts", {}))
+    flags = FLAGS_OF_SWEEP if job.swept else FLAGS
     counts, quality = tally.report(), quality_of(job, tables)
     of_tiles = [record["seconds"] for record in tables.records.values()]
     seconds |= {f"tiles.{stage}": sum(each[stage] for each in of_tiles) for stage in ("read", "match", "write")}
@@ -81,6 +101,7 @@ def report_of(
         "origin": origin_of(job.inputs),
         "local_ranges": prepared.ranges and prepared.ranges.report() | {"share": prepared.ranges.share},
         "inputs": job.inputs,
+        **({"sweep": job.swept.report} if job.swept else {}),
         "tiles": {
             "region": asdict(grid.region),
             "rows": grid.rows,
@@ -94,9 +115,7 @@ def report_of(
         "ambiguity_percentiles": None if config.ambiguity is None else {"p1": scale.p1, "p99": scale.p99},
         "counts": counts,
         "counts_meaning": _COUNTS_MEANING,
-        "validity_bits": {
-            flag.name: {"bit": flag.bit, "meaning": flag.meaning, "invalid": flag.invalid} for flag in FLAGS
-        },
+        "validity_bits": {one.name: {"bit": one.bit, "meaning": one.meaning, "invalid": one.invalid} for one in flags},
         "seconds": {stage: round(value, 3) for stage, value in seconds.items()},
         "versions": dict(_versions()),
         "quality": quality,

@@ -35,7 +35,7 @@ def frame_of(job: Job, tile: Tile) -> PatchFrame:
 def read_source(job: Job, block: Tile, ranges: LocalRanges | None, seconds: dict[str, float]) -> Source:
     """Read the images in the windows of a block's tiles."""
     job.check_version()  # before any work
-    cost = cost_of(job.config, Given(job.prepared.statistics, job.inputs, job.volume_of))
+    cost = cost_of(job.config, Given(job.prepared.statistics, job.inputs, job.volume_of, job.ground(), ranges))
     areas = (patch_areas(frame_of(job, tile), job.config, ranges) for tile in job.store.grid.within(block.core))
     windows = [cost.windows(of_tile) for of_tile in areas]
     with timed(seconds, "read"):
@@ -44,7 +44,7 @@ def read_source(job: Job, block: Tile, ranges: LocalRanges | None, seconds: dict
 
 def _views(job: Job, block: Tile, windows: Sequence[Window]) -> Views:
     """Read windows of the images; the first of a block's steps keeps them on the disk, in the type of the file."""
-    images = job.left, job.right
+    images = tuple(job.images.values())
     are_kept = job.hands_states_on and not is_remote(job.config.cluster)
     if are_kept and (kept := job.store.read(PIXELS, block.name)) is not None:
         return tuple(

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,6 +15,7 @@ from sat_intervals.store.tiles import home_of
 
 RUN_REPORT = "run.json"
 OUTPUTS = (*(file.name for file in RUN_FILES), RUN_REPORT)
+OUTPUTS_OF_SWEEP = ("dsm.tif", *OUTPUTS[1:])
 # What every report of a run has.
 _SECTIONS = {"settings", "inputs", "tiles"}
 
@@ -23,7 +24,12 @@ NextStep = Literal["start", "resume", "start anew", "complete"]
 
 def files_of_run(config: Config) -> tuple[File, File]:
     """Return the files that a run writes."""
-    return run_files(config.products.compression, config.extra_bands)
+    return run_files(config.products.compression, config.extra_bands, of_heights=not config.cost.compares_two)
+
+
+def outputs_of(config: Config) -> tuple[str, ...]:
+    """Return the names of all files that a run writes."""
+    return *(file.name for file in files_of_run(config)), RUN_REPORT
 
 
 def read_report(out: Path) -> dict[str, Any] | None:
@@ -41,19 +47,21 @@ def read_report(out: Path) -> dict[str, Any] | None:
 
 def is_complete(out: Path) -> bool:
     """Return whether a folder has all files of a complete run."""
-    return read_report(out) is not None and all((out / name).exists() for name in OUTPUTS)
+    report = read_report(out)
+    names = OUTPUTS if report is None or "sweep" not in report else OUTPUTS_OF_SWEEP
+    return report is not None and all((out / name).exists() for name in names)
 
 
-def check_folder(out: Path, *, overwrite: bool) -> None:
+def check_folder(out: Path, *, overwrite: bool, names: Sequence[str] = OUTPUTS) -> None:
     """Raise if a folder cannot be that of a run, or has files of its names that no run has made."""
     if os.path.lexists(out) and not os.path.isdir(out):
         raise SatIntervalsError(f"{out} is not a folder: choose another")
-    if folders := [name for name in OUTPUTS if os.path.isdir(out / name)]:
+    if folders := [name for name in names if os.path.isdir(out / name)]:
         raise SatIntervalsError(f"{out / folders[0]} is a folder: move it away or choose another folder")
     if overwrite or read_report(out) is not None:
         return
     is_begun = os.path.exists(home_of(out) / MANIFEST)  # a death may have left rasters, but no report
-    if there := [name for name in OUTPUTS if os.path.lexists(out / name) and (not is_begun or name == RUN_REPORT)]:
+    if there := [name for name in names if os.path.lexists(out / name) and (not is_begun or name == RUN_REPORT)]:
         raise SatIntervalsError(
             f"{out / there[0]} exists and is of no complete run: move it away, choose another folder or "
             "--overwrite (overwrite=True)"
@@ -61,7 +69,13 @@ def check_folder(out: Path, *, overwrite: bool) -> None:
 
 
 def next_step(
-    out: Path, manifest: Mapping[str, Any], run: str, settings: Mapping[str, Any], *, overwrite: bool
+    out: Path,
+    manifest: Mapping[str, Any],
+    run: str,
+    settings: Mapping[str, Any],
+    *,
+    overwrite: bool,
+    names: Sequence[str] = OUTPUTS,
 ) -> NextStep:
     """Return what to do in the folder of a run with this manifest, name and settings; raise if it must be refused."""
     report, home = read_report(out), home_of(out)
@@ -87,7 +101,7 @@ def next_step(
             f"{out} already holds {_other_run(report, manifest, settings)}: choose another folder or "
             "--overwrite (overwrite=True)"
         )
-    check_folder(out, overwrite=False)
+    check_folder(out, overwrite=False, names=names)
     return "resume" if there else "start"
 
 

@@ -12,13 +12,14 @@ from sat_intervals.config import Config
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match import postprocess, refinement
 from sat_intervals.match.around import with_agreement
+from sat_intervals.match.ground import GroundViews
 from sat_intervals.match.memory import STRIP_PIXELS
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, halo, postprocess_strip
 from sat_intervals.match.refinement import pixel_windows, pixels_of
 from sat_intervals.match.statistics import Tally
 from sat_intervals.prepare.local import given_disparities
 from sat_intervals.progress import Progress
-from sat_intervals.raster import BLOCK, RUN_FILES, codec_versions, compressed, factors, halved, read_views
+from sat_intervals.raster import BLOCK, codec_versions, compressed, factors, halved, read_views
 from sat_intervals.run.job import Job
 from sat_intervals.run.state import files_of_run
 from sat_intervals.run.workers import Task, Workers, check_not_full, computing, picklable_errors, reason, results
@@ -132,8 +133,9 @@ def finish_strip(job: Job, of: str, key: PartKey, scale: ConfidenceScale) -> str
         intervals, validity = np.empty((4 + len(extra), *shape), np.float32), np.empty((1, *shape), np.uint16)
         given = given_disparities(job.config, Window(region.row + first, region.column, *shape))
         tally, row = Tally(search.count, search.minimum), 0
+        counts = list[np.ndarray]()
         try:
-            pieces = raw_rows(job, job.config, top, bottom)
+            pieces = raw_rows(job, job.config, top, bottom, counts)
             for final in postprocess_strip(pieces, first - top, shape[0], scale, job.config):
                 rows = slice(row, row := row + len(final.validity))
                 if given is not None:
@@ -143,18 +145,37 @@ def finish_strip(job: Job, of: str, key: PartKey, scale: ConfidenceScale) -> str
                 tally.add(final)
         except DamagedTilesError as error:
             return str(error)
+        if job.swept:
+            count = np.concatenate(counts)[first - top :][: shape[0]]
+            intervals = _heights(intervals, count, job.ground())
         _write(job, of, key, [intervals, validity], counts=tally.counts())
     return None
 
 
-def raw_rows(job: Job, config: Config, first: int, last: int) -> Iterator[RawRows]:
-    """Yield raw products of the rows ``[first, last)`` of the region, with the pixels that the settings need."""
+def _heights(bands: np.ndarray, count: np.ndarray, ground: GroundViews | None) -> np.ndarray:
+    """Return the bands of SURFACE of disparities, which are steps of height, their bounds and confidence."""
+    assert ground is not None
+    heights = ground.base + ground.step * bands[:3].astype(np.float64)
+    known = np.isfinite(bands[0])
+    seen, nothing = np.where(known, count, np.nan), np.full(known.shape, np.nan)
+    return np.stack([*heights, seen, np.where(known, bands[3], np.nan), nothing]).astype(np.float32)
+
+
+def raw_rows(
+    job: Job, config: Config, first: int, last: int, counts: list[np.ndarray] | None = None
+) -> Iterator[RawRows]:
+    """Yield raw products of the rows ``[first, last)`` of the region, with the pixels that the settings need.
+
+    The images that see the cells of a sweep are appended to ``counts``.
+    """
     region, search = job.store.grid.region, config.disparity
     if config.fits:
         window = Window(region.row + first, region.column, last - first, region.width)
         left, right = pixels_of(read_views((job.left, job.right), pixel_windows(window, config)))
     row = 0
     for piece in job.store.strips(max(1, STRIP_PIXELS // region.width), search.count, first, last):
+        if (count := piece.pop("count", None)) is not None and counts is not None:
+            counts.append(count)
         rows = RawRows(
             **{"lower_low": piece["lower"], "upper_low": piece["upper"]} | piece
         )  # both if there is one level
@@ -170,7 +191,7 @@ def reduce_rows(job: Job, of: str, key: PartKey, below: Sequence[PartKey]) -> st
         for part in map(part_name, below):
             try:
                 with job.store.opened(PARTS, part, of) as archive:
-                    halves.append([archive[_HALF.format(file.kind)] for file in RUN_FILES])
+                    halves.append([archive[_HALF.format(file.kind)] for file in files_of_run(job.config)])
             except DamagedFileError:
                 return str(damaged_parts(job, [part]))
         _write(job, of, key, [np.concatenate(of_file, axis=1) for of_file in zip(*halves, strict=True)])

@@ -11,7 +11,7 @@ from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.kernels.sgm import LAST, WAVEFRONTS, Borders, Edge
 from sat_intervals.match.borders import Border, Place, borders_of, in_order, rehulled, sources, trace_area
 from sat_intervals.match.local_ranges import LocalRanges, narrowed
-from sat_intervals.match.patch import Patch, PatchFrame, frame_area, frames_of, match_patch, path_window
+from sat_intervals.match.patch import Patch, PatchFrame, frame_area, frames_of, match_patch, patch_areas, path_window
 from sat_intervals.match.schedule import Step, needs
 from sat_intervals.products import NO_DISPARITY
 from sat_intervals.progress import timed
@@ -75,10 +75,14 @@ def _match_tile(
             if job.hands_states_on:
                 borders = [_borders(job, tile, view, handed, ranges) for view in range(len(costs))]
             patch = match_patch(frame, costs, job.config, borders, ranges)
+        count = costs[0].seen
         del costs, borders
         with timed(seconds, "write"):
             products = _tile_products(patch, tile, job)
-    usable = {side: int((view.state == 0).sum()) for side, view in zip(("left", "right"), views, strict=True)}
+            if count is not None:
+                base = patch_areas(frame, job.config, ranges)[0].base
+                products["count"] = count[tile.core.relative_to(base).slices]
+    usable = {side: int((view.state == 0).sum()) for side, view in zip(job.images, views, strict=True)}
     if handed:
         handed[LAST][_place(tile)] = patch.leaving
     with timed(seconds, "write"):
