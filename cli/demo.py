@@ -2,7 +2,7 @@
 
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -29,18 +29,36 @@ if TYPE_CHECKING:
     show_default=True,
     help="Height of a mountain under the city; 1 m is a disparity of 1 px.",
 )
+@click.option(
+    "--images",
+    type=click.IntRange(3, 24),
+    metavar="N",
+    help="Make N raw images, whose models are off by a pixel, and the surface of all of them.",
+)
 @settings_options
 @run_options
 def demo(
-    out: Path, size: tuple[int, int], seed: int, relief: float, settings: SettingsArguments, run: RunArguments
+    out: Path,
+    size: tuple[int, int],
+    seed: int,
+    relief: float,
+    images: int | None,
+    settings: SettingsArguments,
+    run: RunArguments,
 ) -> None:
     """Make a procedural satellite scene, match it and print how often the interval contains the truth.
 
     \b
     OUT/left.tif, OUT/right.tif   the pair, georeferenced, no data in a corner
     OUT/truth.tif                 the exact disparity
-    and the files of `match`.
+    and the files of `match`; with --images
+    OUT/1.tif, OUT/2.tif, ...     raw images with RPC models
+    OUT/truth.tif                 the exact heights
+    and the files of `surface`.
     """  # noqa: D301 (\b keeps the line breaks in click)
+    if images:
+        _demo_of_many(out, images, size, settings, run, seed=seed, relief=relief)
+        return
     from sat_intervals.demo import PIXEL, make_scene
     from sat_intervals.evaluate.disparity import evaluate_run
     from sat_intervals.raster import north_up
@@ -65,6 +83,35 @@ def demo(
                 f"The interval contains the truth for {100 * figures['accuracy']:.1f} % of {figures['count']} pixels, "
                 f"at a mean width of {figures['mean_width']:.2f} px."
             )
+    run.check_strict(report["warnings"])
+
+
+def _demo_of_many(
+    out: Path, count: int, size: tuple[int, int], settings: SettingsArguments, run: RunArguments, **scene: Any
+) -> None:
+    """Make raw images and the surface of all of them, and compare it with the true heights."""
+    from sat_intervals.config import load_config
+    from sat_intervals.demo import PIXEL
+    from sat_intervals.evaluate.surface_accuracy import evaluate_surface
+    from sat_intervals.workflows.demo import write_views
+    from sat_intervals.workflows.many import surface_of_many
+
+    settings.check_kept(out, out / "truth.tif", out / "dsm.tif")
+    config = load_config(settings.file or {"preset": "many"}, settings.sections)
+    how = {"keep_tiles": run.keep_tiles, "overwrite": run.overwrite}
+    with run.console() as console:
+        console.progress("scene", 0, 1)
+        paths, truth = write_views(out, *size, count, overwrite=run.overwrite, **scene)
+        console.progress("scene", 1, 1)
+        report = surface_of_many(paths, out, config, resolution=PIXEL, progress=console.progress, **how)
+    figures = evaluate_surface(out / "dsm.tif", truth)["all"]
+    run.say({"run": report, "truth": figures})
+    if not run.as_json:
+        console.summary_of_many(report, out)
+        console.say(
+            f"The interval contains the true height for {100 * figures['coverage']:.1f} % of the cells; NMAD of height "
+            f"- truth {figures['nmad']:.2f} m."
+        )
     run.check_strict(report["warnings"])
 
 

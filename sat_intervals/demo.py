@@ -125,48 +125,123 @@ def make_scene(
 
     `relief` is the height of a mountain (m) under the city; 1 m is a disparity of 1 px.
     """
-    random, halo = np.random.default_rng([seed, 1]), int(np.ceil(3 * psf))
-    kernel = np.exp(-0.5 * (np.arange(-halo * OVER, halo * OVER + 1) / OVER / max(psf, 0.01)) ** 2)
-    across, down = kernel / kernel.sum(), kernel[::OVER] / kernel[::OVER].sum()
-    at = np.arange(-halo * OVER, (columns + halo) * OVER) / OVER
-    centres = slice(halo * OVER, (halo + columns) * OVER, OVER)
-    images, lines = np.zeros((2, rows, columns), np.uint16), deque[Array](maxlen=down.size)
+    blur = _Blur.of(psf, columns)
     truth, visible = np.full((rows, columns), np.nan, np.float32), np.zeros((rows, columns), bool)
     starts = np.ceil(CORNER[1] * columns * (1 - np.arange(rows) / (CORNER[0] * rows))).clip(0).astype(int)
-    for profile in profiles(rows, columns, seed, halo, block, relief):
-        (height, left, seen), (_, right, _) = (look(profile, view, at) for view in (0, 1))
-        fine = np.stack([left, right])
-        lines.append(sum(w * fine[:, k : k + columns * OVER : OVER] for k, w in enumerate(across)))
-        if 0 <= (row := profile[0]) < rows:
-            truth[row] = (VIEWS[1] - VIEWS[0]) * (height[centres] - DATUM)
-            truth[row, : starts[row]] = np.nan  # NaN makes the comparisons below false
-            partner = np.arange(columns) + truth[row]
-            visible[row] = seen[centres] & (partner >= starts[row]) & (partner <= columns - 1)
-        if (row := profile[0] - halo) >= 0:
-            light = sum(w * line for w, line in zip(down, lines, strict=True))
-            level = OFFSET[:, None] + GAIN[:, None] * light
-            level += random.standard_normal(level.shape) * np.sqrt(level * MID_LEVEL) / snr
-            images[:, row, starts[row] :] = np.rint(level).clip(1, SATURATION)[:, starts[row] :]
+
+    def lines() -> Iterator[tuple[int, Array]]:
+        for profile in profiles(rows, columns, seed, blur.halo, block, relief):
+            (height, left, seen), (_, right, _) = (look(profile, view, blur.at) for view in (0, 1))
+            if 0 <= (row := profile[0]) < rows:
+                truth[row] = (VIEWS[1] - VIEWS[0]) * (height[blur.centres] - DATUM)
+                truth[row, : starts[row]] = np.nan  # NaN makes the comparisons below false
+                partner = np.arange(columns) + truth[row]
+                visible[row] = seen[blur.centres] & (partner >= starts[row]) & (partner <= columns - 1)
+            yield row, np.stack([left, right])
+
+    images = np.zeros((2, rows, columns), np.uint16)
+    for row, level in _exposed(lines(), blur, OFFSET, GAIN, snr, np.random.default_rng([seed, 1])):
+        images[:, row, starts[row] :] = level[:, starts[row] :]
     minimum, maximum = int(np.floor(np.nanmin(truth))) - SPARE, int(np.ceil(np.nanmax(truth))) + SPARE
     return Scene(images[0], images[1], truth, visible, minimum, maximum)
 
 
+def make_views(
+    rows: int,
+    columns: int,
+    slants: Sequence[float],
+    seed: int = 0,
+    *,
+    relief: float = 0,
+    psf: float = 0.6,
+    snr: float = 95,
+    change: float = 0.1,
+    block: int = 64,
+) -> tuple[Array, Array]:
+    """Return raw images of many views, `(views, rows, columns)` uint16, and the heights (m) of the ground below them.
+
+    A view shows `x = u + slant * (height - DATUM)`, in px per metre; it has its own contrast, noise, and a smooth
+    change of the ground's brightness by up to `change`, as between dates. Heights, `(rows, columns)` float32, are
+    those of the highest points above pixel centres.
+    """
+    random = np.random.default_rng([seed, 2])
+    blur, count = _Blur.of(psf, columns), len(slants)
+    lattices = random.uniform(-1, 1, (count, 256, 256))
+    heights = np.zeros((rows, columns), np.float32)
+
+    def lines() -> Iterator[tuple[int, Array]]:
+        for profile in profiles(rows, columns, seed, blur.halo, block, relief):
+            row = profile[0]
+            if 0 <= row < rows:
+                heights[row] = shown(profile, 0.0, np.arange(columns, dtype=float))[0]
+            seen = [shown(profile, slant, blur.at)[1] for slant in slants]
+            changes = [_noise(np.pad(one, (0, 1), mode="wrap"), np.array(row), blur.at, 60, 1) for one in lattices]
+            yield row, np.stack(seen) * (1 + change * np.stack(changes))
+
+    images = np.zeros((count, rows, columns), np.uint16)
+    offset, gain = random.uniform(60, 90, count), random.uniform(2300, 2600, count)
+    for row, level in _exposed(lines(), blur, offset, gain, snr, random):
+        images[:, row] = level
+    return images, heights
+
+
+@dataclass(frozen=True)
+class _Blur:
+    """Weights of a Gaussian blur along and across rows, rows around, positions of samples, and the pixel centres."""
+
+    across: Array
+    down: Array
+    halo: int
+    at: Array
+    centres: slice
+
+    @classmethod
+    def of(cls, psf: float, columns: int) -> "_Blur":
+        halo = int(np.ceil(3 * psf))
+        kernel = np.exp(-0.5 * (np.arange(-halo * OVER, halo * OVER + 1) / OVER / max(psf, 0.01)) ** 2)
+        at = np.arange(-halo * OVER, (columns + halo) * OVER) / OVER
+        centres = slice(halo * OVER, (halo + columns) * OVER, OVER)
+        return cls(kernel / kernel.sum(), kernel[::OVER] / kernel[::OVER].sum(), halo, at, centres)
+
+
+def _exposed(
+    lines: Iterator[tuple[int, Array]], blur: _Blur, offset: Array, gain: Array, snr: float, random: np.random.Generator
+) -> Iterator[tuple[int, Array]]:
+    """Yield rows of images with their numbers: radiances of fine lines `(views, samples)`, blurred, with noise."""
+    held = deque[Array](maxlen=blur.down.size)
+    for line, fine in lines:
+        stop = fine.shape[1] - blur.across.size + 1
+        held.append(sum(w * fine[:, k : k + stop : OVER] for k, w in enumerate(blur.across)))
+        if (row := line - blur.halo) >= 0:
+            light = sum(w * one for w, one in zip(blur.down, held, strict=True))
+            level = offset[:, None] + gain[:, None] * light
+            level += random.standard_normal(level.shape) * np.sqrt(level * MID_LEVEL) / snr
+            yield row, np.rint(level).clip(1, SATURATION)
+
+
 def look(profile: Profile, view: int, x: Array) -> tuple[Array, Array, Array]:
     """Return height (m), radiance and visibility in the other view, at columns `x` of view 0 (left) or 1 (right)."""
-    row, u, height, radiance = profile
-    here, there = (u + a * (height - DATUM) for a in (VIEWS[view], VIEWS[1 - view]))
-    k, share = _highest_crossing(here, x, VIEWS[view])
-    high, shown, other = (v[k] + share * (v[k + 1] - v[k]) for v in (height, radiance, there))
+    high, shine, k, share = shown(profile, VIEWS[view], x)
+    there = profile[1] + VIEWS[1 - view] * (profile[2] - DATUM)
+    other = there[k] + share * (there[k + 1] - there[k])
     if VIEWS[1 - view] > 0:
         seen = other > np.maximum.accumulate(there)[k] - 1e-6
     else:
         seen = other < np.minimum.accumulate(there[::-1])[::-1][k + 1] + 1e-6
+    return high, shine, seen
+
+
+def shown(profile: Profile, slant: float, x: Array) -> tuple[Array, Array, Array, Array]:
+    """Return height (m) and radiance at columns `x` of a view, and node k and share of the way to k + 1 shown there."""
+    row, u, height, radiance = profile
+    k, share = _highest_crossing(u + slant * (height - DATUM), x, slant)
+    high, shine = (v[k] + share * (v[k + 1] - v[k]) for v in (height, radiance))
     wall = np.flatnonzero(np.abs(height[k + 1] - height[k]) > STEP)
-    k = k[wall]
-    floor = (high[wall] - np.minimum(height[k], height[k + 1])) % 3
+    at = k[wall]
+    floor = (high[wall] - np.minimum(height[at], height[at + 1])) % 3
     window = np.where((floor > 1.3) & (row % 6 > 2), 0.6, 1)
-    shown[wall] = window * np.where(height[k + 1] > height[k], 0.8 * radiance[k + 1], 0.35 * radiance[k])
-    return high, shown, seen
+    shine[wall] = window * np.where(height[at + 1] > height[at], 0.8 * radiance[at + 1], 0.35 * radiance[at])
+    return high, shine, k, share
 
 
 def _highest_crossing(x: Array, at: Array, slant: float) -> tuple[Array, Array]:
