@@ -23,6 +23,9 @@ STAGES = {
     "range": "finding the search range",
     "rows": "comparing rows",
     "images": "measuring images",
+    "heights": "finding heights",
+    "shifts": "finding shifts of the images",
+    "ortho": "resampling rows to the surface",
     "tiles": "matching tiles",
     "bands": "postprocessing rows",
     "points": "triangulating rows",
@@ -132,6 +135,32 @@ class Console:
             self.say(f"of an earlier run: {', '.join(old)}: make them again")
         if then:
             self.say(f"next: sat-intervals {then} {quote(str(out))}")
+
+    def summary_of_many(self, report: dict[str, Any], out: Path) -> None:
+        """Print the table at the end of a sweep of many images, its shifts and warnings."""
+        counts, swept = report["counts"], report["sweep"]
+        cells, step = swept["cells"], swept["step"]
+        images = Table("image", "row", "column", "likeness", box=None, pad_edge=False)
+        for one in swept["images"]:
+            images.add_row(Path(one["path"]).name, *(f"{part:+.2f}" for part in one["shift"]), f"{one['alike']:.2f}")
+        self.say("shifts of the models (px), and likeness to the other images (-1 to 1)")
+        self._terminal.print(images)
+        table = Table(show_header=False, box=None, pad_edge=False)
+        table.add_column(style="bold")
+        table.add_column(justify="right")
+        table.add_row("cells", f"{cells['rows']} x {cells['columns']} of {cells['resolution']:g} m in {swept['crs']}")
+        table.add_row(
+            "heights searched", f"{swept['heights'][0]:.0f} to {swept['heights'][1]:.0f} m, every {step:.2f} m"
+        )
+        seen = counts["pixels"] - counts["causes"]["left_window"]
+        table.add_row("height, of cells that two images see", _share(counts["valid"], seen))
+        width = counts["median_interval_width"]
+        table.add_row("median half width", "none" if width is None else f"+-{width * step / 2:.2f} m")
+        table.add_row("time", f"{report['seconds']['total']:.1f} s")
+        self._terminal.print(table)
+        warn(report["warnings"])
+        for name in ("dsm.tif", "validity.tif", "run.json"):
+            self.say(str(out / name))
 
     def batch_summary(self, report: dict[str, dict[str, Any]]) -> None:
         """Print the table at the end of a batch: the state of each pair, and its surface if any pair has one."""

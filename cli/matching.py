@@ -13,6 +13,7 @@ from sat_intervals.cli.options import (
     NAME,
     PRESETS,
     Command,
+    Decorator,
     Printing,
     expert_option,
     gathered,
@@ -39,6 +40,7 @@ class PairArguments:
     nodata: tuple[float, float] | None
     band: tuple[int, int] | None
     region: tuple[int, int, int, int] | None = None
+    more: tuple[str, ...] = ()
 
     @property
     def window(self) -> "Window | None":
@@ -119,12 +121,7 @@ class _Both(click.ParamType):  # type: ignore[type-arg,unused-ignore]
         return left, right_or_left
 
 
-# The command gets ``pair``.
-image_options = gathered(
-    "pair",
-    PairArguments,
-    click.argument("left", type=NAME),
-    click.argument("right", type=NAME),
+IMAGE_OPTIONS = (
     click.option("--left-mask", type=NAME, help="Mask of the left image: non-zero = masked."),
     click.option("--right-mask", type=NAME, help="Mask of the right image."),
     click.option(
@@ -133,15 +130,18 @@ image_options = gathered(
         metavar="V",
         help="No-data value of both images, or LEFT,RIGHT; replaces that of the files.",
     ),
-    expert_option("--band", type=_Both(int), metavar="N", help="Band to match in both images, or LEFT,RIGHT."),
+    expert_option("--band", type=_Both(int), metavar="N", help="Band to match in the images, or LEFT,RIGHT."),
 )
+# The command gets ``pair``.
+_PAIR = click.argument("left", type=NAME), click.argument("right", type=NAME)
+image_options = gathered("pair", PairArguments, *_PAIR, *IMAGE_OPTIONS)
 
 
-def pair_options(command: Command) -> Command:
+def pair_options(command: Command, images: Decorator = image_options) -> Command:
     """Add options for an epipolar pair and the region to match; the command gets ``pair``, a `PairArguments`."""
     names = "--window", "region"
     text = "Region of the left image to match."
-    return image_options(click.option(*names, type=int, nargs=4, metavar="ROW COL HEIGHT WIDTH", help=text)(command))
+    return images(click.option(*names, type=int, nargs=4, metavar="ROW COL HEIGHT WIDTH", help=text)(command))
 
 
 _LEVEL_OPTIONS = (

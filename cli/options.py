@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
 
 # Copied from `sat_intervals.config`, which --help must not import.
-PRESETS = ("satellite", "satellite-mccnn", "paper", "mccnn")
+PRESETS = ("satellite", "satellite-mccnn", "paper", "mccnn", "many")
 
 # Pictures that `plot` writes to the folder of a run, without their ending.
 PICTURES = ("overview", "errors", "coverage", "range", "rows", "profile", "curve", "dsm")

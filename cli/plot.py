@@ -3,11 +3,14 @@
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from sat_intervals.cli.options import FILE, PICTURES, TOLERANCE, log_options, truth_option
+
+if TYPE_CHECKING:
+    from sat_intervals.results import Results
 
 
 @click.command(short_help="Draw a finished run: maps, profile of a row, errors, cost curve of a pixel.")
@@ -37,7 +40,7 @@ def plot(
     """Draw pictures of the finished run in the folder OUT and write them there.
 
     \b
-    OUT/overview.png   always: left image, disparity, width, confidence, validity
+    OUT/overview.png   pairs: left image, disparity, width, confidence, validity
     OUT/errors.png     with a truth and intervals: pixels whose interval misses it
     OUT/coverage.png   with --beside: coverage asked for and measured, width
     OUT/rows.png       if rows were compared: offsets, and what is left of them
@@ -46,24 +49,22 @@ def plot(
     OUT/curve.png      with --pixel: cost curve of a pixel and its interval
     OUT/dsm.png        with dsm.tif: hillshade, height, half width, confidence
 
-    Rows and columns count from 0 at the first pixel of OUT/intervals.tif. Needs matplotlib: pip install
-    'sat-intervals[plot]'.
+    Of three images and more, only dsm.png is drawn. Rows and columns count from 0 at the first pixel of
+    OUT/intervals.tif. Needs matplotlib: pip install 'sat-intervals[plot]'.
     """  # noqa: D301 (\b keeps the line breaks in click)
-    from sat_intervals.errors import SatIntervalsError
     from sat_intervals.results import open_results
-    from sat_intervals.show.accuracy import check_one_pair, draw_coverage
+    from sat_intervals.show.accuracy import draw_coverage
     from sat_intervals.show.maps import draw_errors, draw_overview
     from sat_intervals.show.preparation import draw_range, draw_rows, has_range, has_rows
     from sat_intervals.show.profile import draw_curve, draw_profile
     from sat_intervals.show.surface_map import draw_surface
 
     results = open_results(out, truth)
+    if results.is_sweep:
+        _plot_sweep(results, dpi, {"row": row, "columns": columns, "pixel": pixel, "beside": beside or None})
+        return
     is_judged = results.truth is not None and results.config.interval is not None
-    if beside and not is_judged:
-        raise SatIntervalsError(f"--beside compares coverages, but {out} has no truth or no intervals: give --truth")
-    check_one_pair([out, *beside])
-    if columns is not None and row is None:
-        raise SatIntervalsError(f"--columns {columns[0]} {columns[1]} belong to a profile: give --row too")
+    _check_options(results, row, columns, beside, is_judged=is_judged)
     results.check_kept([out / f"{name}.png" for name in PICTURES], [truth, judging["mask"], out / "dsm.tif"])
     drawings: dict[str, Callable[[Path], None]] = {"overview": lambda target: draw_overview(results, target, dpi)}
     if is_judged:
@@ -84,3 +85,30 @@ def plot(
     for name, draw in drawings.items():
         draw(out / f"{name}.png")
         click.echo(out / f"{name}.png")
+
+
+def _check_options(
+    results: "Results", row: int | None, columns: tuple[int, int] | None, beside: tuple[Path, ...], *, is_judged: bool
+) -> None:
+    from sat_intervals.errors import SatIntervalsError
+    from sat_intervals.show.accuracy import check_one_pair
+
+    if beside and not is_judged:
+        where = f"{results.out} has no truth or no intervals"
+        raise SatIntervalsError(f"--beside compares coverages, but {where}: give --truth")
+    check_one_pair([results.out, *beside])
+    if columns is not None and row is None:
+        raise SatIntervalsError(f"--columns {columns[0]} {columns[1]} belong to a profile: give --row too")
+
+
+def _plot_sweep(results: "Results", dpi: int, of_pair: dict[str, Any]) -> None:
+    """Draw the heights of many images; raise if an option is given that only a pair has."""
+    from sat_intervals.errors import SatIntervalsError
+    from sat_intervals.show.surface_map import draw_surface
+
+    if given := [name for name, value in of_pair.items() if value is not None]:
+        many = f"{results.out} is of {len(results.images)} images"
+        raise SatIntervalsError(f"--{given[0]} is for a pair, {many}: leave it out")
+    results.check_kept([results.out / "dsm.png"])
+    draw_surface(results.out / "dsm.tif", results.out / "dsm.png", dpi)
+    click.echo(results.out / "dsm.png")

@@ -65,6 +65,7 @@ def evaluate_run(
         The folder is not a run, there is no truth, or sizes do not fit.
     """
     run = open_run(out)
+    run.check_pair()
     config = run.config
     if config.interval is None:
         raise SatIntervalsError(f"{out} has no intervals, its setting interval is null: run match with intervals")

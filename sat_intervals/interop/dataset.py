@@ -17,6 +17,7 @@ from sat_intervals.results import open_run
 from sat_intervals.tiling import Window
 
 _PLACE = "spatial_ref"  # the name that rioxarray and odc-geo look for
+_SURFACE = "surface model with intervals"
 
 
 class _LazyBand(BackendArray):
@@ -55,7 +56,8 @@ def open(out: str | Path, chunks: int | None = 2048) -> xr.Dataset:
     -------
     Dataset
         With the dimensions ``y`` and ``x``: ``disparity``, ``lower``, ``upper``, ``width`` (pixels), ``confidence`` and
-        ``validity``, whose attributes list its flags. The coordinate ``spatial_ref`` has CRS and transform by the CF
+        ``validity``, whose attributes list its flags; of many images, the variables of `open_surface`, ``width``
+        (metres) and ``validity``. The coordinate ``spatial_ref`` has CRS and transform by the CF
         conventions. Attributes are ``finished`` and ``preset``. The accessor ``intervals`` has methods, see
         `Intervals`.
 
@@ -66,10 +68,13 @@ def open(out: str | Path, chunks: int | None = 2048) -> xr.Dataset:
     """
     run = open_run(out)
     dataset = xr.Dataset(coords=_coordinates(run.georeferencing, run.shape))
-    dataset.attrs = {"title": "disparity with intervals", "source": "sat-intervals", "finished": run.report["finished"]}
+    title = _SURFACE if run.is_sweep else "disparity with intervals"
+    dataset.attrs = {"title": title, "source": "sat-intervals", "finished": run.report["finished"]}
     if run.config.preset:
         dataset.attrs["preset"] = run.config.preset
-    for file in run_files(run.config.products.compression, run.config.extra_bands):
+    if run.is_sweep:
+        dataset.attrs |= _attributes_of_surface(run.out / "dsm.tif")
+    for file in run_files("", run.config.extra_bands, of_heights=run.is_sweep):
         _add_bands(dataset, file, run.out / file.name, run.shape)
     dataset["validity"].attrs = flag_attributes()
     if chunks is not None:
@@ -104,15 +109,20 @@ def open_surface(path: str | Path, chunks: int | None = 2048) -> xr.Dataset:
     """
     file = Path(path)
     shape, place = surface_place(file)
-    tags = read_tags(file)
     dataset = xr.Dataset(coords=_coordinates(place, shape))
-    dataset.attrs = {"title": "surface model with intervals", "source": "sat-intervals"}
-    dataset.attrs["vertical_datum"] = datum = tags["HEIGHTS"].removeprefix("above ")
-    dataset.attrs |= {name: float(tags[name.upper()]) for name in ("coverage", "alpha") if name.upper() in tags}
+    dataset.attrs = {"title": _SURFACE, "source": "sat-intervals"} | _attributes_of_surface(file)
+    datum = dataset.attrs["vertical_datum"]
     _add_bands(dataset, surface_file(file.name), file, shape)
     level = "reference_ellipsoid" if datum.endswith("ellipsoid") else "geopotential_datum"
     dataset["height"].attrs["standard_name"] = f"height_above_{level}"
     return dataset if chunks is None else dataset.chunk({"y": chunks, "x": chunks})
+
+
+def _attributes_of_surface(file: Path) -> dict[str, Any]:
+    """Return what the heights of a surface model are above, and the level of its intervals."""
+    tags = read_tags(file)
+    levels = {name: float(tags[name.upper()]) for name in ("coverage", "alpha") if name.upper() in tags}
+    return {"vertical_datum": tags["HEIGHTS"].removeprefix("above "), **levels}
 
 
 def _add_bands(dataset: xr.Dataset, file: File, path: Path, shape: tuple[int, int]) -> None:
@@ -162,9 +172,14 @@ class Intervals:
         self._dataset = dataset
 
     def width(self) -> xr.DataArray:
-        """Return the width of the intervals in pixels, NaN where there is none."""
-        width = self._dataset["upper"] - self._dataset["lower"]
-        return width.assign_attrs(long_name=WIDTH, units="px")
+        """Return the width of the intervals in pixels, or in metres of heights; NaN where there is none."""
+        lower, upper = self._bounds()
+        name = WIDTH if lower.name == "lower" else "width of the height's interval"
+        return (upper - lower).assign_attrs(long_name=name, units="px" if lower.name == "lower" else "m")
+
+    def _bounds(self) -> tuple[xr.DataArray, xr.DataArray]:
+        start = "" if "lower" in self._dataset else "height_"
+        return self._dataset[f"{start}lower"], self._dataset[f"{start}upper"]
 
     def flags(self) -> xr.Dataset:
         """Return the decoded validity flags, see `decode_flags`."""
@@ -173,9 +188,9 @@ class Intervals:
     def coverage(self, truth: xr.DataArray | np.ndarray) -> float:
         """Return the share of intervals of valid pixels that contain the truth, NaN if no truth is known.
 
-        ``truth`` is the true disparity in pixels, as large as the dataset; NaN where unknown.
+        ``truth`` is the true disparity in pixels, or height in metres, as large as the dataset; NaN where unknown.
         """
-        lower, upper, validity = (self._dataset[name].variable for name in ("lower", "upper", "validity"))
+        lower, upper, validity = (one.variable for one in (*self._bounds(), self._dataset["validity"]))
         if truth.shape != lower.shape:
             sizes = f"the truth has the shape {truth.shape}, the intervals {lower.shape}"
             raise SatIntervalsError(f"{sizes}: select the same part")
@@ -187,10 +202,11 @@ class Intervals:
 
     def profile(self, row: int, columns: Sequence[int] | None = None) -> xr.Dataset:
         """Return one row, counted from 0 at the top, read into memory; ``columns`` are the first and the last."""
-        rows, width = self._dataset["lower"].shape
+        lower, _ = self._bounds()
+        rows, width = lower.shape
         first, last = columns or (0, width - 1)
         if not (0 <= row < rows and 0 <= first <= last < width):
             part = f"row {row}, columns {first} to {last} are outside the dataset"
             raise SatIntervalsError(f"{part}: rows are 0 to {rows - 1}, columns 0 to {width - 1}")
-        down, across = self._dataset["lower"].dims
+        down, across = lower.dims
         return self._dataset.isel({down: row, across: slice(first, last + 1)}).compute()

@@ -69,6 +69,7 @@ def export(out: str | Path, form: str, target: str | Path, *, overwrite: bool = 
     For ``asp`` the target is the prefix of the file, such as ``stereo/run`` of ``stereo/run-F.tif``.
     """
     run, target = open_run(out), Path(target)
+    run.check_pair()
     left = run.report["inputs"]["left"]
     shape = left["height"], left["width"]
     folder, prefix = (target.parent, target.name) if form == "asp" else (target, "")

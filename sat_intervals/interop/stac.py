@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.products import FLAGS, SURFACE, Band, interval_bands
-from sat_intervals.raster import footprint, read_layers, read_place, read_tags
+from sat_intervals.products import SURFACE, SURFACE_OF_SWEEP, Band, interval_bands
+from sat_intervals.raster import acquired, footprint, read_layers, read_place, read_tags
 from sat_intervals.raster.publishing import write_record
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import strips
@@ -23,7 +23,6 @@ _EXTENSIONS = [
     for name in ("projection/v2.0.0", "file/v2.1.0", "processing/v1.1.0")
 ]
 _COG = "image/tiff; application=geotiff; profile=cloud-optimized"
-_VALIDITY = Band("validity", "", "; ".join(f"bit {flag.bit} {flag.name}: {flag.meaning}" for flag in FLAGS))
 _STRIP = 1 << 22  # pixels
 _SHA256 = "1220"  # code and length of a multihash
 _FIRST = "1959-08-14T00:00:00Z"  # no satellite has taken an image before
@@ -34,7 +33,8 @@ def write_item(out: str | Path, *, taken: str | None = None, identifier: str | N
     """Write ``stac.json`` to the folder of a finished run: a STAC 1.1 item with its rasters as assets.
 
     ``taken`` is when the left image was taken, ISO 8601 with a time zone; by default the time in its TIFF tags. Without
-    one, it is null, between the first satellite image and the end of the run.
+    one, it is null, between the first satellite image and the end of the run. Of a sweep of many images it is null,
+    between their first and last day if their tags have them all.
     ``dsm.tif``, ``overview.png`` and ``report.html`` are assets if they belong to this run.
     """
     run = open_run(out)
@@ -45,7 +45,14 @@ def write_item(out: str | Path, *, taken: str | None = None, identifier: str | N
 
 
 def _times(run: Run, taken: str | None) -> dict[str, str | None]:
-    """Return when the left image was taken, as STAC wants it."""
+    """Return when the left image was taken, as STAC wants it, or the first and the last image of a sweep."""
+    if run.is_sweep and taken is None:
+        paths = [Path(one["path"]) for one in run.images.values()]
+        days = [acquired(str(path)) if path.is_file() else None for path in paths]
+        known = sorted(f"{day:%Y-%m-%d}" for day in days if day)
+        if len(known) == len(days):
+            first, last = f"{known[0]}T00:00:00Z", f"{known[-1]}T23:59:59Z"
+            return {"datetime": None, "start_datetime": first, "end_datetime": last}
     image = Path(run.report["inputs"]["left"]["path"])
     if taken is None and image.is_file() and (tag := read_tags(image).get("TIFFTAG_DATETIME")):
         with suppress(ValueError):
@@ -71,6 +78,11 @@ def _item(run: Run, times: dict[str, str | None], identifier: str) -> dict[str, 
     if corners is None and "dsm" in assets:
         shape, place = read_place(run.out / "dsm.tif")
         corners = footprint(place, shape)
+    title = f"Disparity with intervals of {Path(run.report['inputs']['left']['path']).name}"
+    lineage = "dense stereo matching of an epipolar pair by sat-intervals"
+    if run.is_sweep:
+        title = f"Surface model with intervals of {len(run.images)} images"
+        lineage = "plane sweep and semi-global matching of many images in object space by sat-intervals"
     item: dict[str, Any] = {
         "type": "Feature",
         "stac_version": "1.1.0",
@@ -80,12 +92,12 @@ def _item(run: Run, times: dict[str, str | None], identifier: str) -> dict[str, 
         "properties": {
             **times,
             "created": _time(run.report["finished"]),
-            "title": f"Disparity with intervals of {Path(run.report['inputs']['left']['path']).name}",
+            "title": title,
             "processing:software": run.report["versions"],
-            "processing:lineage": "dense stereo matching of an epipolar pair by sat-intervals",
+            "processing:lineage": lineage,
             "processing:expression": {"format": "sat-intervals settings", "expression": run.report["settings"]},
         },
-        "links": [_link(run, side) for side in ("left", "right")],
+        "links": [_link(run, *image) for image in run.images.items()],
         "assets": assets,
     }
     if corners:
@@ -121,23 +133,27 @@ def _cut(ring: list[list[float]], meridian: float, side: int) -> list[list[float
     return kept
 
 
-def _link(run: Run, side: str) -> dict[str, str]:
+def _link(run: Run, title: str, record: dict[str, Any]) -> dict[str, str]:
     """Return the link to an image: a local file relative to the folder, any other name as it is."""
-    record = run.report["inputs"][side]
     href = record["path"]
     if Path(href).exists():
         href = Path(os.path.relpath(href, run.out.resolve())).as_posix()
     checksum = {"file:checksum": _SHA256 + record["sha256"]} if record.get("sha256") else {}
-    return {"rel": "derived_from", "href": href, "title": f"{side} image"} | checksum
+    return {"rel": "derived_from", "href": href, "title": title} | checksum
 
 
 def _assets(run: Run) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the key and the content of each asset; surface and maps of other runs are left out."""
-    bands = interval_bands(run.config.extra_bands)
-    yield "intervals", _raster(run, "intervals.tif", "Disparity, its interval, confidence", bands)
-    yield "validity", _raster(run, "validity.tif", "Validity flags", (_VALIDITY,))
+    if not run.is_sweep:
+        bands = interval_bands(run.config.extra_bands)
+        yield "intervals", _raster(run, "intervals.tif", "Disparity, its interval, confidence", bands)
+    flags = "; ".join(
+        f"bit {flag['bit']} {name}: {flag['meaning']}" for name, flag in run.report["validity_bits"].items()
+    )
+    yield "validity", _raster(run, "validity.tif", "Validity flags", (Band("validity", "", flags),))
     if run.has_current("dsm.tif"):
-        yield "dsm", _raster(run, "dsm.tif", "Surface model with intervals", SURFACE)
+        bands = SURFACE_OF_SWEEP if run.is_sweep else SURFACE
+        yield "dsm", _raster(run, "dsm.tif", "Surface model with intervals", bands)
     report = {"title": "Settings, inputs, counts, times, versions", "type": "application/json", "roles": ["metadata"]}
     yield "report", report | _file(run.out / "run.json")
     pictures = (

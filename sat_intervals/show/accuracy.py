@@ -22,7 +22,8 @@ def check_one_pair(runs: Sequence[Path]) -> None:
     """Raise if runs have read other images than the first one, or are no runs; copies of images are the same."""
     images = []
     for run in runs:
-        inputs = open_run(run).report["inputs"]
+        (opened := open_run(run)).check_pair()
+        inputs = opened.report["inputs"]
         images.append([inputs[side].get(key) for side in ("left", "right") for key in ("bytes", "sha256", "etag")])
         if images[-1] != images[0]:
             raise SatIntervalsError(f"{run} is a run of other images than {runs[0]}: give runs of one pair")

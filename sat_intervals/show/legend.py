@@ -1,5 +1,6 @@
 """Define the pixel classes of maps and reports, their colours, and the ends of colour scales."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,6 +33,12 @@ PIXEL_CLASSES = (
     PixelClass(SKY, "valid, low confidence", REGULARIZED),
     *(PixelClass(_INVALID[flag.name], flag.meaning, flag.value) for flag in FLAGS if flag.invalid),
 )
+
+
+def classes_of(report: Mapping[str, Any]) -> list[PixelClass]:
+    """Return PIXEL_CLASSES with what their flags mean in a ``run.json``."""
+    meanings = {1 << flag["bit"]: flag["meaning"] for flag in report["validity_bits"].values() if flag["invalid"]}
+    return [kind._replace(meaning=meanings.get(kind.flag, kind.meaning)) for kind in PIXEL_CLASSES]
 
 
 def classify(validity: np.ndarray) -> np.ndarray:

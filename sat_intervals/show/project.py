@@ -13,7 +13,7 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.products import BANDS, SURFACE
+from sat_intervals.products import BANDS, SURFACE, SURFACE_OF_SWEEP
 from sat_intervals.raster import Georeferencing, open_image, read_layers, read_place, read_small_layers
 from sat_intervals.raster.publishing import write_file
 from sat_intervals.raster.windows import read_small_image
@@ -57,7 +57,8 @@ def write_project(out: str | Path) -> list[Path]:
     """Write ``project.qgz`` to the folder of a finished run, and the default styles of its rasters; return the files.
 
     The project has the images and the truth, disparity, interval width, confidence and validity; if ``dsm.tif`` is
-    of this run, also its heights. Paths in it are relative where the files are local.
+    of this run, also its heights. Of a sweep of many images it has heights and validity. Paths in it are relative where
+    the files are local.
     """
     run = open_run(out)
     file = run.out / "project.qgz"
@@ -78,14 +79,16 @@ def write_project(out: str | Path) -> list[Path]:
 
 
 def _results(run: Run) -> Iterator[ProjectLayer]:
-    group, shape, place = "Disparity", run.shape, run.georeferencing
-    intervals = Raster(run.out / "intervals.tif", place, shape)
+    group, shape, place = "Heights" if run.is_sweep else "Disparity", run.shape, run.georeferencing
     validity = Raster(run.out / "validity.tif", place, shape)
-    disparity, lower, upper, *_ = read_small_layers(intervals.source, _fitting(shape))
     counts = np.zeros(1 << 16, np.int64)
     for window in run.windows():
         counts += np.bincount(read_layers(validity.source, window).ravel(), minlength=counts.size)
     yield ProjectLayer(group, "validity", "flags of every pixel", validity, styles.validity_classes(counts), True)
+    if run.is_sweep:
+        return
+    intervals = Raster(run.out / "intervals.tif", place, shape)
+    disparity, lower, upper, *_ = read_small_layers(intervals.source, _fitting(shape))
     yield ProjectLayer(group, "confidence", BANDS[3].meaning, intervals, styles.shares(4))
     if run.config.interval:
         width = Raster(run.out / "width.vrt", place, shape, styles.difference(("intervals.tif", 3, 2), place, shape))
@@ -103,16 +106,19 @@ def _surface(run: Run) -> Iterator[ProjectLayer]:
     surface = Raster(file, place, shape)
     half = Raster(run.out / "dsm_half_width.vrt", place, shape, styles.difference((file.name, 3, 2), place, shape, 0.5))
     height, lower, upper, *_ = read_small_layers(file, _fitting(shape))
+    meanings = {band.name: band.meaning for band in (SURFACE_OF_SWEEP if run.is_sweep else SURFACE)}
     wide = styles.widths(1, (upper - lower) / 2, unit="m")
     yield ProjectLayer(group, "half width", "half the width of the height's interval, m", half, wide, True)
-    yield ProjectLayer(group, "confidence of heights", SURFACE[4].meaning, surface, styles.shares(5))
+    yield ProjectLayer(group, "confidence of heights", meanings["confidence"], surface, styles.shares(5))
     ramp = styles.colours(1, height, styles.VIRIDIS, unit="m")
-    yield ProjectLayer(group, "height", SURFACE[0].meaning, surface, ramp, True, True, _MULTIPLY)
+    yield ProjectLayer(group, "height", meanings["height"], surface, ramp, True, True, _MULTIPLY)
     yield ProjectLayer(group, "hillshade", "shaded heights", surface, styles.hillshade(1), is_shown=True)
 
 
 def _images(run: Run) -> Iterator[ProjectLayer]:
-    """Yield truth and images; those that cannot be opened are left out."""
+    """Yield truth and images; those that cannot be opened are left out, and raw ones, which are on no map."""
+    if run.is_sweep:
+        return
     for name in ("truth", "left", "right") if run.truth_beside.exists() else ("left", "right"):
         try:
             image = open_input(run.report["inputs"]["left" if name == "truth" else name])

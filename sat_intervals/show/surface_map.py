@@ -8,10 +8,9 @@ from sat_intervals.products import SURFACE
 from sat_intervals.raster import read_small_layers, read_tags, surface_place
 from sat_intervals.show import canvas
 from sat_intervals.show.legend import limits
+from sat_intervals.show.relief import relief
 
 _LONGEST = 5.5  # inches of the longer side of a map
-_SUN = np.array([-0.5, 0.5, np.sqrt(0.5)])  # direction to the sun (east, north, up): north-west, 45 degrees high
-_FLATTENED = 0.3  # factor on heights before slopes: noise of 0.1 m is steep between cells of 0.5 m
 _NO_DATA = "#a8c4dd"
 # Percentile of half widths at the end of their scale, which is at most so many times their median: a strip of wide
 # intervals then leaves the others their colours.
@@ -49,11 +48,11 @@ def draw_surface(surface: Path, target: Path, dpi: int = canvas.DPI) -> None:
     )
     with canvas.page(target, (2 * (inches[1] + 1.4), 2 * (inches[0] + 0.7) + 0.3), dpi, caption) as figure:
         first, *panels = figure.subplots(2, 2).ravel()
-        relief = _relief(height, across, down)
+        shade = relief(height, across, down)
         canvas.draw_map(
-            first, frame, relief, "Hillshade, sun in the north-west; blue: no data", cmap="gray", vmin=0, vmax=1
+            first, frame, shade, "Hillshade, sun in the north-west; blue: no data", cmap="gray", vmin=0, vmax=1
         )
-        canvas.say_empty(first, relief, "no value")
+        canvas.say_empty(first, shade, "no value")
         first.set_facecolor(_NO_DATA)  # flat ground is grey too
         for panel, layer in zip(panels, layers, strict=False):
             bar = canvas.draw_layer(panel, frame, layer)
@@ -70,12 +69,3 @@ def _middle_and_end(halves: np.ndarray) -> tuple[str, float]:
         return "", 1.0
     middle, most = np.percentile(known, (50, _MOST))
     return f", median +-{middle:.2f} m", float(min(most, _TIMES * middle)) or 1.0
-
-
-def _relief(height: np.ndarray, across: float, down: float) -> np.ndarray:
-    """Return the hillshade, 0 to 1, NaN beside holes, by central differences; cells of ``across`` x ``down`` m."""
-    if min(height.shape) < 2:
-        return np.full(height.shape, np.nan)
-    down_slope, across_slope = np.gradient(_FLATTENED * height, down, across)
-    normal = np.stack([-across_slope, down_slope, np.ones_like(height)])
-    return np.asarray(np.tensordot(_SUN, normal / np.linalg.norm(normal, axis=0), axes=1).clip(0, 1))

@@ -131,6 +131,7 @@ def _of_pair(pair: Pair, truth: Path, choices: Choices) -> CalibrationScene:
 def _of_run(source: Source, choices: Choices) -> CalibrationScene:
     """Open a finished run, with its own settings unless others are chosen."""
     run = open_results(source.name, source.truth)
+    run.check_pair()
     if run.truth is None:
         raise SatIntervalsError(f"{run.out}: there is no truth.tif beside its left image {run.left.path}: give --truth")
     if choices.config or (choices.overrides or {}).keys() & {"preset", "cost"}:

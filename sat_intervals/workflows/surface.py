@@ -10,6 +10,7 @@ from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.dsm import check_sensors, checked_cells, make_surface, surface_tags
 from sat_intervals.heights.geometry import geometry_warnings, set_geometry
 from sat_intervals.heights.rectify import IMAGES, rectified_files
+from sat_intervals.match.costs import check_cost
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, check_not_replaced, files_of, open_image
 from sat_intervals.run.pair import match_pair
@@ -92,6 +93,7 @@ def surface(
         Tiles failed; no output was published.
     """
     config, out = load_config(config), Path(out)
+    check_cost(config)
     cells = {"resolution": resolution, "crs": crs, "radius": radius, "geoid": geoid and Path(geoid)}
     choices = choices or SurfaceChoices()
     check_cells(cells, choices, resolved(config).interval)

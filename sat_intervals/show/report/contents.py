@@ -11,19 +11,22 @@ import numpy as np
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.products import Bands
 from sat_intervals.results import Results
-from sat_intervals.show.legend import PIXEL_CLASSES, classify, limits
+from sat_intervals.show.legend import classes_of, classify, limits
+from sat_intervals.show.relief import relief
 
 _PIXELS = 500_000  # on the page, 5 to 8 bytes each when compressed and encoded
 _WIDTH_BARS, _CONFIDENCE_BARS = 60, 25
 _STEPS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)  # bar widths of the histogram of interval widths, px
-_FINEST = 1 / 64  # pixels of disparity
+_FINEST = {"px": 1 / 64, "m": 1 / 256}  # of disparities, of heights
+_WIDE = 30  # metres, the last bar of widths of height intervals
 
 
 class Histograms:
     """Histograms of interval width and confidence over all pixels, gathered strip by strip."""
 
-    def __init__(self, count: int) -> None:
-        """Start with empty histograms; ``count`` is the number of disparities searched."""
+    def __init__(self, results: Results) -> None:
+        """Start with empty histograms; widths are up to the search range, or to _WIDE metres."""
+        count = _WIDE if results.is_sweep else results.config.disparity.count
         self._step = next(step for step in _STEPS if count / step <= _WIDTH_BARS or step == _STEPS[-1])
         self._width_bars = math.ceil(count / self._step)
         self._counts: dict[str, Any] = defaultdict(int)
@@ -76,26 +79,30 @@ class Pixels:
         if np.isfinite(bands.truth).any():
             disparities["truth"] = bands.truth
         # Leave room for a truth outside the search range: its extent once more on either side.
-        search = self._results.config.disparity
-        first, step = search.minimum - search.count, max(_FINEST, 3 * search.count / 65534)
-        black, white = limits(bands.image)
+        search, image = self._results.quantity, bands.image
+        extent = search.maximum - search.minimum + search.step
+        first, step = search.minimum - extent, max(_FINEST[search.unit], 3 * extent / 65534)
+        if self._results.is_sweep:
+            across, down = (self._step * side for side in self._results.georeferencing.pixel_size)
+            image = relief(disparities["disparity"].astype(np.float64), across, down)
+        black, white = limits(image)
         layers = {name: _coded(values, first, step, "<u2") for name, values in disparities.items()}
         if local := self._results.report.get("local_ranges"):
             minimum, maximum = LocalRanges.of_report(local).at(self._results.region, self._step)
-            layers["searched"] = _coded(maximum - minimum + 1.0, 0, 1, "<u2")
+            layers["searched"] = _coded((maximum - minimum + 1.0) * search.step, 0, search.step, "<u2")
         return {
             "step": self._step,
             "rows": kind.shape[0],
             "columns": kind.shape[1],
             "layers": {
                 **layers,
-                "image": _coded(bands.image, black, (white - black) / 254, "u1"),
+                "image": _coded(image, black, (white - black) / 254, "u1"),
                 "confidence": _coded(bands.confidence, 0, 1 / 250, "u1"),
                 "kind": _coded(kind, 0, 1, "u1"),
                 "low": _coded(low, 0, 1, "u1"),
                 "missed": _coded(np.where(valid, missed, 0), 0, 1, "u1"),
             },
-            "kinds": [{"colour": each.colour, "meaning": each.meaning} for each in PIXEL_CLASSES],
+            "kinds": [{"colour": each.colour, "meaning": each.meaning} for each in classes_of(self._results.report)],
         }
 
 

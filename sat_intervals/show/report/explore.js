@@ -1,7 +1,9 @@
 // The map, its layers, and the profile of the selected row.
 
 const pixels = contents.pixels;
-const search = contents.run.settings.disparity;
+const search = contents.quantity; // disparities in pixels, or heights in metres
+const quantity = (value) => (contents.run.sweep ? fixed(value, 2) : short(value));
+const titled = (text) => text[0].toUpperCase() + text.slice(1);
 const COLOURS = {
   grey: ["#000000", "#ffffff"],
   viridis: ["#440154", "#472d7b", "#3b528b", "#2c728e", "#21918c", "#28ae80", "#5ec962", "#addc30", "#fde725"],
@@ -57,17 +59,17 @@ function makeLayers() {
   const { first, step } = pixels.layers.image;
   const width = data.upper.map((upper, i) => upper - data.lower[i]);
   const layers = [
-    { name: "Left image", values: data.image, colours: COLOURS.grey, shown: [first, first + 254 * step] },
-    { name: "Disparity", unit: "px", values: data.disparity, colours: COLOURS.viridis,
+    { name: contents.run.sweep ? "Hillshade" : "Left image", values: data.image, colours: COLOURS.grey, shown: [first, first + 254 * step] },
+    { name: titled(search.name), unit: search.unit, values: data.disparity, colours: COLOURS.viridis,
       shown: limits(data.disparity, [search.minimum, search.maximum]) },
     { name: "Confidence", values: data.confidence, colours: COLOURS.cividis, shown: [0, 1] },
     { name: "Validity", values: data.kind, kinds: pixels.kinds.map((kind) => [kind.meaning, kind.colour]), counts: contents.classes },
   ];
   if (hasIntervals) {
     const shown = [0, quantiles(width, WIDEST)[0] || 1];
-    layers.splice(2, 0, { name: "Interval width", unit: "px, square-root scale", values: width, colours: COLOURS.magma, shown, power: 0.5 });
+    layers.splice(2, 0, { name: "Interval width", unit: `${search.unit}, square-root scale`, values: width, colours: COLOURS.magma, shown, power: 0.5 });
   }
-  if (data.searched) layers.push({ name: "Disparities searched", unit: "count", values: data.searched, colours: COLOURS.viridis, shown: [0, search.maximum - search.minimum + 1] });
+  if (data.searched) layers.push({ name: `${titled(search.plural)} searched`, unit: contents.run.sweep ? "m" : "count", values: data.searched, colours: COLOURS.viridis, shown: [0, search.maximum - search.minimum + search.step] });
   if (data.truth && hasIntervals) layers.push({ name: "Misses", values: data.missed, kinds: [null, ...MISSES] });
   return layers;
 }
@@ -147,7 +149,7 @@ function drawProfile(width) {
   const known = [...lower, ...upper, ...disparity, ...truth].filter(Number.isFinite);
   const up = known.length ? [Math.min(...known) - 1, Math.max(...known) + 1] : [search.minimum - 1, search.maximum + 1];
   const across = [-0.5 * pixels.step, (pixels.columns - 0.5) * pixels.step];
-  const { x, y, box, parts } = chart(width, 320, across, up, { across: "column", up: "disparity (px)" });
+  const { x, y, box, parts } = chart(width, 320, across, up, { across: "column", up: `${search.name} (${search.unit})` });
   const edge = (column) => x((column - 0.5) * pixels.step).toFixed(1);
   const sections = runs(low, (value) => value === 1).map(([first, last]) =>
     svg("rect", { x: edge(first), y: box.top, width: edge(last) - edge(first), height: box.bottom - box.top, fill: "var(--low)" }));
@@ -168,9 +170,10 @@ function drawProfile(width) {
 /** Describe the selected pixel in words. */
 function describe() {
   const i = selected.row * pixels.columns + selected.column;
+  const digits = contents.run.sweep ? 2 : 1;
   const parts = [`Row ${selected.row * pixels.step}, column ${selected.column * pixels.step}: ${pixels.kinds[data.kind[i]].meaning}`];
-  if (Number.isFinite(data.disparity[i])) parts.push(`disparity ${fixed(data.disparity[i], 2)} px`);
-  if (Number.isFinite(data.lower[i])) parts.push(`interval ${fixed(data.lower[i], 1)} to ${fixed(data.upper[i], 1)} px`);
+  if (Number.isFinite(data.disparity[i])) parts.push(`${search.name} ${fixed(data.disparity[i], 2)} ${search.unit}`);
+  if (Number.isFinite(data.lower[i])) parts.push(`interval ${fixed(data.lower[i], digits)} to ${fixed(data.upper[i], digits)} ${search.unit}`);
   if (Number.isFinite(data.confidence[i])) parts.push(`confidence ${fixed(data.confidence[i], 2)}`);
   if (data.truth && Number.isFinite(data.truth[i])) parts.push(`truth ${fixed(data.truth[i], 2)} px`);
   return parts.join(", ");
@@ -215,12 +218,12 @@ function showMap() {
 
 /** Set up the profile, and the sliders and clicks that select its row. */
 function showProfile() {
-  const entries = [["disparity", "var(--ink)", true], ["low confidence", "var(--low)"]];
+  const entries = [[search.name, "var(--ink)", true], ["low confidence", "var(--low)"]];
   if (hasIntervals) entries.unshift(["interval", "var(--band)"]);
   if (data.truth) entries.push(["truth", "var(--truth)", true]);
   const gaps = element("span", { class: "quiet" }, `no ${hasIntervals ? "band" : "black line"}: no valid pixel`);
   find("profile-key").append(...legend(entries), gaps);
-  const redraw = drawing(find("profile"), 320, "Interval, disparity and truth along the selected row", drawProfile);
+  const redraw = drawing(find("profile"), 320, `Interval, ${search.name} and truth along the selected row`, drawProfile);
   Object.assign(find("row"), { max: pixels.rows - 1 });
   Object.assign(find("column"), { max: pixels.columns - 1 });
   for (const name of ["row", "column"]) {
@@ -231,6 +234,7 @@ function showProfile() {
     const row = Math.floor(((event.clientY - box.top) / box.height) * pixels.rows);
     choose(row, Math.floor(((event.clientX - box.left) / box.width) * pixels.columns), redraw);
   });
+  find("command").parentElement.hidden = !!contents.run.sweep;
   choose(Math.floor(pixels.rows / 2), Math.floor(pixels.columns / 2), redraw);
 }
 

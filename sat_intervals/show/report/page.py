@@ -15,7 +15,7 @@ from sat_intervals.evaluate.disparity import evaluate_run
 from sat_intervals.raster import read_place, read_small_layers
 from sat_intervals.raster.publishing import write_file
 from sat_intervals.results import Results
-from sat_intervals.show.legend import PIXEL_CLASSES, class_counts
+from sat_intervals.show.legend import class_counts, classes_of
 from sat_intervals.show.report.contents import Histograms, Pixels
 
 _CELLS = 1000  # rows and columns of a surface that are read
@@ -33,7 +33,14 @@ def _page(contents: Mapping[str, Any]) -> str:
     # A "<" in the contents could end the script element.
     data = json.dumps(contents, separators=(",", ":")).replace("<", "\\u003c")
     script = "".join(map(_asset, ("draw.js", "explore.js", "tables.js")))
-    parts = {"summary": _summary(contents), "style": _asset("report.css"), "script": script, "contents": data}
+    title = f"{contents['quantity']['name'].capitalize()} intervals"
+    parts = {
+        "title": title,
+        "summary": _summary(contents),
+        "style": _asset("report.css"),
+        "script": script,
+        "contents": data,
+    }
     return re.sub(rf"/\* ({'|'.join(parts)}) \*/", lambda found: parts[found[1]], _asset("report.html"))
 
 
@@ -43,15 +50,21 @@ def _asset(name: str) -> str:
 
 def _contents(results: Results) -> dict[str, Any]:
     """Return all data of the page."""
-    histograms, pixels = Histograms(results.config.disparity.count), Pixels(results)
+    histograms, pixels = Histograms(results), Pixels(results)
     for row, bands in results.strips():
         low = results.low(bands)
         histograms.add(bands, low)
         pixels.add(row, bands, low)
     truth = results.truth.image.path if results.truth else None
+    run, name = results.report, Path(results.left.path).name
+    if results.is_sweep:  # steps of height are no disparities
+        settings = {section: values for section, values in run["settings"].items() if section != "disparity"}
+        inputs = {key: one for key, one in run["inputs"].items() if key not in ("left", "right")}
+        run, name = run | {"settings": settings, "inputs": inputs}, f"{len(results.images)} images"
     return {
-        "run": results.report,
-        "name": Path(results.left.path).name,
+        "run": run,
+        "quantity": results.quantity._asdict(),
+        "name": name,
         "folder": shlex.quote(str(results.out.resolve())),
         "histograms": histograms.report(),
         "classes": class_counts(results.report["counts"]),
@@ -94,17 +107,20 @@ def _rows(run: Mapping[str, Any]) -> dict[str, str]:
 def _summary(contents: Mapping[str, Any]) -> str:
     """Return the main figures of a run as rows of an HTML table, for browsers without scripts."""
     run, counts = contents["run"], contents["run"]["counts"]
-    region, search, width = run["tiles"]["region"], run["settings"]["disparity"], counts["median_interval_width"]
+    region, search, width = run["tiles"]["region"], contents["quantity"], counts["median_interval_width"]
+    swept, unit = "sweep" in run, search["unit"]
+    form = ".2f" if swept else ".6g"
+    images = ", ".join(one["path"] for one in run["sweep"]["images"]) if swept else run["inputs"]["left"]["path"]
     rows = {
-        "left image": run["inputs"]["left"]["path"],
+        "images" if swept else "left image": images,
         "size": f"{region['height']} x {region['width']} pixels",
-        "search range": f"{search['minimum']} to {search['maximum']} px",
+        "search range": f"{search['minimum']:{form}} to {search['maximum']:{form}} {unit}",
         "verdict": run["verdict"],
         **{f"warning {number}": line for number, line in enumerate(run["warnings"], start=1)},
         **_rows(run),
-        "median interval width": "none" if width is None else f"{width} px",
+        "median interval width": "none" if width is None else f"{width * search['step']:{form}} {unit}",
     }
-    for kind, count in zip(PIXEL_CLASSES, contents["classes"], strict=True):
+    for kind, count in zip(classes_of(run), contents["classes"], strict=True):
         if count:
             rows[kind.meaning] = f"{100 * count / counts['pixels']:.1f} % of the pixels"
     accuracy = contents["evaluation"] and contents["evaluation"]["all"]["accuracy"]

@@ -4,14 +4,14 @@ const run = contents.run;
 
 function showHeadline() {
   const { height, width } = run.tiles.region;
-  document.title = `${contents.name}: disparity intervals`;
+  document.title = `${contents.name}: ${search.name} intervals`;
   find("about").textContent =
     `${contents.name}, ${grouped(height)} rows by ${grouped(width)} columns, ` +
-    `disparities ${short(search.minimum)} to ${short(search.maximum)} px, matched ${run.finished.slice(0, 10)}.`;
+    `${search.plural} ${quantity(search.minimum)} to ${quantity(search.maximum)} ${search.unit}, matched ${run.finished.slice(0, 10)}.`;
   const { pixels: all, valid, low_confidence: low, median_interval_width: median } = run.counts;
   const figures = [
     ["valid pixels", percent(valid / all)],
-    ["median interval width", median === null ? "none" : `${median} px`],
+    ["median interval width", median === null ? "none" : `${quantity(median * search.step)} ${search.unit}`],
     ["low confidence, of valid pixels", percent(low / valid)],
     ["time", `${fixed(run.seconds.total, 1)} s`],
   ];
@@ -64,7 +64,7 @@ function showHistogram(place, { step, bars }, kinds, names) {
 function showHistograms() {
   const { width, confidence } = contents.histograms;
   showHistogram(find("widths"), width, [["high", "high confidence", "var(--band)"], ["low", "low confidence", "var(--truth)"]], {
-    title: "Interval width of valid pixels", across: "width (px)",
+    title: "Interval width of valid pixels", across: run.sweep ? "width (m), last bar: and wider" : "width (px)",
   });
   showHistogram(find("confidences"), confidence, [["valid", "valid", "var(--band)"], ["rejected", "not valid", "var(--truth)"]], {
     title: "Confidence of searched pixels", across: "confidence",
@@ -124,7 +124,23 @@ function showValidity() {
   );
 }
 
+/** Show what was found of many images: heights, shifts of their models, likeness. */
+function showSweep() {
+  const { images, left_out: out, step, crs, cells } = run.sweep;
+  find("search-title").textContent = "Images and heights";
+  const rows = images.map(({ path, shift, alike }) => [path.split("/").at(-1), ...shift.map((part) => fixed(part, 2)), fixed(alike, 2)]);
+  find("search").append(
+    element("p", {}, `Heights ${quantity(search.minimum)} to ${quantity(search.maximum)} m, every ${fixed(step, 2)} m, ` +
+      `for cells of ${short(cells.resolution)} m in ${crs}. Left out: ${out.length ? out.join(", ") : "no image"}.`),
+    table(["image", "shift of its model, rows of the image", "columns", "likeness to the others (\u22121 to 1)"], rows),
+  );
+}
+
 function showSearch() {
+  if (run.sweep) {
+    showSweep();
+    return;
+  }
   const { valid, range_ends: ends } = run.counts;
   const { search: found, local_ranges: local, quality } = run;
   const place = find("search");
