@@ -12,11 +12,15 @@ import hypothesis
 import numpy as np
 import pytest
 from helpers import PLACE, VRT, wait_until, write_pair
+from sweeps import Sweep
+from sweeps import swept as make_sweep
 
 from sat_intervals import load_config, match_pair
 from sat_intervals.demo import Scene, make_scene
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.raster import write_layer
+from sat_intervals.workflows.demo import write_views
+from sat_intervals.workflows.many import surface_of_many
 
 pytest_plugins = ["services.browser", "services.s3", "services.slurm", "services.web"]
 
@@ -105,6 +109,21 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
     whole = settings | {"tiles": {"size": 512}}
     match_pair(folder / "left.tif", folder / "right.tif", folder / "undisturbed", whole)
     return folder
+
+
+@pytest.fixture(scope="session")
+def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a finished sweep of three images, which are beside it: 1.tif, 2.tif, 3.tif."""
+    folder = tmp_path_factory.mktemp("swept")
+    images, _ = write_views(folder, 200, 200, 3)
+    surface_of_many(images, folder / "out", resolution=0.5)
+    return folder / "out"
+
+
+@pytest.fixture(scope="session")
+def sweep(tmp_path_factory: pytest.TempPathFactory) -> Sweep:
+    """A surface of five images, made in one tile."""
+    return make_sweep(tmp_path_factory.mktemp("sweep"), config={"preset": "many", "tiles": {"size": 256}})
 
 
 @pytest.fixture(scope="session")

@@ -19,7 +19,7 @@ FLOORS = [
     {"products", "tiling", "machine", "progress", "demo", "errors", "configs"},
 ]
 FLOOR_OF = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
-MOST_ENTRIES, MOST_ARROWS = 20, 100
+MOST_ENTRIES, MOST_ARROWS = 20, 106
 
 # The only room that may import a library.
 HOMES = {
@@ -47,9 +47,13 @@ HOMES = {
 # Without docstrings. Callbacks of click commands are exempt from the limit of parameters: they have one per option.
 MOST_FUNCTION_LINES, MOST_MODULE_LINES, MOST_PARAMETERS = 45, 300, 8
 OVER_THE_LIMITS = {
+    "sat_intervals.demo": "one generator of scenes, for pairs and for many views",
+    "sat_intervals.demo.make_views": "what views of a scene are made of, by name",
     "sat_intervals.interop.cars_method.run": "its parameters are those of CARS' method",
+    "sat_intervals.kernels.plane_sweep.sweep": "the arrays of a kernel",
     "sat_intervals.run.pair.match_pair": "what a run takes, with a matcher of one's own",
     "sat_intervals.workflows.calibrate.calibrate": "how pairs are matched and compared with their truth, by name",
+    "sat_intervals.workflows.many.surface_of_many": "what a sweep takes, by name",
     "sat_intervals.workflows.rectify.rectify": "what raw images need, by name",
     "sat_intervals.workflows.surface.surface": "what its three steps take, by name",
 }

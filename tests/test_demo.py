@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sat_intervals.demo import DATUM, GAIN, OFFSET, VIEWS, Scene, look, make_scene, profiles
+from sat_intervals.demo import DATUM, GAIN, OFFSET, VIEWS, Scene, look, make_scene, make_views, profiles
 
 ROWS, COLUMNS = 300, 420  # with a river, houses, blocks, wood and fields
 
@@ -108,3 +108,21 @@ def test_make_scene__seed_decides():
     assert equal(first, again)
     assert not np.array_equal(first.left, second.left)
     assert not np.array_equal(first.truth, second.truth, equal_nan=True)
+
+
+def test_make_views__do_not_depend_on_the_block():
+    images, again = (make_views(90, 110, [-0.7, 0.5], seed=5, block=block) for block in (64, 17))
+    np.testing.assert_array_equal(images[0], again[0])
+    np.testing.assert_array_equal(images[1], again[1])
+
+
+@pytest.mark.parametrize("slant", [-0.3, 0.3])
+def test_make_views__show_the_ground_at_the_columns_of_its_heights(slant):
+    images, heights = make_views(120, 260, [0.0, slant], seed=5, snr=np.inf, change=0.0)
+    columns, alike = np.arange(260.0), []
+    for nadir, slanted, high in zip(*images.astype(float), heights, strict=True):
+        there = columns + slant * (high - DATUM)
+        is_flat = np.convolve(np.abs(np.gradient(high)) >= 0.05, np.ones(15), "same") == 0
+        inside = (there > 3) & (there < 256) & is_flat  # far from walls, which hide ground
+        alike.append((nadir[inside], np.interp(there, columns, slanted)[inside]))
+    assert np.corrcoef(*np.concatenate(alike, axis=1))[0, 1] > 0.99

@@ -554,6 +554,7 @@ def test_match__command_line_wins_over_the_file(folder, tmp_path):
     [
         pytest.param(name, marks=pytest.mark.peer("onnxruntime", "mc_cnn") if "mccnn" in name else ())
         for name in PRESETS
+        if name != "many"
     ],
 )
 def test_config__prints_settings_that_match_takes(folder, tmp_path, preset):
@@ -568,6 +569,14 @@ def test_config__prints_settings_that_match_takes(folder, tmp_path, preset):
     assert result.exit_code == 0, result.output
     report = json.loads((tmp_path / "out" / "run.json").read_text())
     assert load_config(report["settings"]) == resolved(settings)
+
+
+def test_match__refuses_the_preset_of_many_images(folder, tmp_path):
+    assert invoke("config", "--preset", "many").stdout == preset_text("many")
+    arguments = "match", folder / "left.tif", folder / "right.tif", tmp_path / "out", "--preset", "many"
+    assert_refused(
+        invoke(*arguments), "cost.method is sweep, which compares many images: use surface with three or more"
+    )
 
 
 def test_config__prints_the_defaults_without_options():
@@ -648,3 +657,34 @@ def test_version__is_that_of_the_package():
 
 def test_commands__are_guessed_at():
     assert_refused(invoke("mach"), "No such command 'mach'", "'match'", "--help")
+
+
+@pytest.mark.peer("shareloc")
+@pytest.mark.parametrize("command", ["triangulate", "dsm", "export", "evaluate", "calibrate", "reference"])
+def test_commands_of_a_pair__refuse_a_run_of_many_images(command, swept, tmp_path):
+    options = {
+        "dsm": ["--resolution", 1, "--output", tmp_path / "dsm.tif"],
+        "export": [tmp_path / "to", "--to", "otb"],
+        "calibrate": ["--output", tmp_path / "calibration.yaml"],
+        "reference": ["--heights", swept / "dsm.tif", "--ellipsoid"],
+    }
+    before = {file: file.read_bytes() for file in swept.glob("*.*")}
+    done = invoke(command, swept, *options.get(command, []))
+    assert done.exit_code == 2
+    assert f"{swept} is the surface of 3 images, without disparities of a pair: use " in done.output
+    assert done.output.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+    assert {file: file.read_bytes() for file in swept.glob("*.*")} == before
+
+
+@pytest.mark.peer("shareloc")
+def test_status__of_many_images_is_complete(swept):
+    assert invoke("status", swept).output == f"{swept}: complete\n"
+
+
+@pytest.mark.peer("shareloc")
+def test_match__refuses_the_folder_of_many_images(swept, folder):
+    done = invoke("match", folder / "left.tif", folder / "right.tif", swept, "--disparity", -20, 20)
+    assert done.exit_code == 2
+    assert f"{swept} already holds another run" in done.output
+    assert "Traceback" not in done.output

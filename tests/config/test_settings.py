@@ -4,7 +4,7 @@ import re
 from collections.abc import Mapping
 from decimal import Decimal
 from pathlib import Path
-from types import MappingProxyType
+from types import MappingProxyType, NoneType
 from typing import Any
 
 import numpy as np
@@ -79,18 +79,33 @@ def test_preset_text__comments_every_setting_with_its_meaning_and_range(name: st
     for line in preset_text(name).splitlines():
         if found := re.fullmatch(r"(\w+):", line):
             section = type(getattr(config, found[1]))
-        elif found := re.fullmatch(r"(?:  |(?=preset|rows))(\w+): \S+ +# (.*)", line):
+        elif found := re.fullmatch(r"(?:  |(?=preset|rows|\w+: null))(\w+): \S+ +# (.*)", line):
             section = section if line.startswith(" ") else Config
             field = section.model_fields[found[1]]
-            assert found[2] == f"{field.description} ({allowed(field)})"
+            about = "" if getattr(config, found[1], "") is None else f"{field.description} "
+            assert found[2] == f"{about}({allowed(field)})"
             commented.append((section, found[1]))
         else:
             assert not line or line.startswith("#")
     expected = []
     for name in Config.model_fields:
         model = type(getattr(config, name))
-        expected += [(Config, name)] if model is str else [(model, key) for key in model.model_fields]
+        expected += [(Config, name)] if model in (str, NoneType) else [(model, key) for key in model.model_fields]
     assert commented == expected
+
+
+def test_load_config__many_images_have_neither_a_right_view_nor_a_share_of_nothing() -> None:
+    many = {"preset": "many"}
+    assert settings(**many).cost.rejected == 0.05
+    assert "has no right image: set cross_check to null" in message(many | {"cross_check": {"method": "fast"}})
+    assert "refinement.method to vfit" in message(many | {"refinement": {"method": "least_squares"}})
+    for key, value, allowed_values in (
+        ("share", 0, "number > 0, <= 1"),
+        ("pairs", 17, "integer >= 1, <= 16"),
+        ("step", 0, "number > 0 or null"),
+        ("doubtful", 1, "number >= 0, < 1"),
+    ):
+        assert message(many | {"cost": {key: value}}).endswith(f"cost.{key} is {value}, allowed: {allowed_values}")
 
 
 # --- presets beside settings

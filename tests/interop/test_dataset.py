@@ -110,3 +110,15 @@ def test_accessor__width_and_profile(made):
     for row, columns in ((70, None), (-1, None), (0, (5, 90)), (0, (8, 3))):
         with pytest.raises(SatIntervalsError, match="are outside the dataset: rows are 0 to 69, columns 0 to 89"):
             dataset.intervals.profile(row, columns)
+
+
+@pytest.mark.peer("shareloc")
+def test_open__of_many_images_has_heights_in_metres(swept):
+    dataset, surface = sat_intervals.open(swept), sat_intervals.open_surface(swept / "dsm.tif")
+    assert {"height", "height_lower", "height_upper", "count", "confidence", "validity", "width"} <= set(dataset)
+    assert "disparity" not in dataset
+    assert_array_equal(dataset["height"], surface["height"])
+    assert dataset["width"].attrs["units"] == surface.intervals.width().attrs["units"] == "m"
+    assert dataset.attrs["vertical_datum"] == "the WGS 84 ellipsoid"
+    assert dataset.intervals.coverage(dataset["height"]) == 1
+    assert dataset.intervals.profile(5)["height"].sizes == {"x": dataset.sizes["x"]}

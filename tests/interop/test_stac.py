@@ -3,6 +3,7 @@
 import hashlib
 import json
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -122,3 +123,24 @@ def test_stac__refuses_times_that_are_none(made, time, says):
     done = invoke("stac", made[0], "--datetime", time)
     assert done.exit_code == 2
     assert re.fullmatch(f"sat-intervals: {time} {says}: .*\n", done.stderr)
+
+
+@pytest.mark.peer("shareloc")
+def test_write_item__of_many_images_has_heights_and_all_images(swept, tmp_path):
+    out = shutil.copytree(swept.parent, tmp_path / "scene") / "out"
+    report = out / "run.json"
+    report.write_text(report.read_text().replace(str(swept.parent), str(out.parent)))
+
+    def item():
+        assert invoke("stac", out).exit_code == 0
+        return json.loads((out / "stac.json").read_text())
+
+    assert list(item()["assets"])[:3] == ["validity", "dsm", "report"]
+    assert [link["href"] for link in item()["links"]] == ["../1.tif", "../2.tif", "../3.tif"]
+    assert item()["properties"]["start_datetime"].startswith("1959")
+    for number, day in enumerate(("2024:05:31", "2023:01:02", "2024:04:01"), start=1):
+        with rasterio.open(out.parent / f"{number}.tif", "r+") as dataset:
+            dataset.update_tags(TIFFTAG_DATETIME=f"{day} 10:20:00")
+    times = item()["properties"]
+    days = "2023-01-02T00:00:00Z", "2024-05-31T23:59:59Z"
+    assert (times["datetime"], times["start_datetime"], times["end_datetime"]) == (None, *days)

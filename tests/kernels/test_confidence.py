@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from sat_intervals.config import Ambiguity
-from sat_intervals.kernels.confidence import low_confidence, normalize
+from sat_intervals.kernels.confidence import low_confidence, normalize, rough
 from sat_intervals.kernels.cost import Codes, between
 from sat_intervals.kernels.matching import match_costs
 from sat_intervals.kernels.sweeps import Settings
@@ -66,9 +66,16 @@ def test_match_costs__without_ambiguity(scene):
 def test_confidence_scale__of_equal_percentiles_is_the_whole_range():
     histogram = np.zeros(71, np.int64)
     histogram[[3, 40]] = 1, 1000
-    assert confidence_scale(Ambiguity(), histogram) == (0, 70)
+    assert confidence_scale(Ambiguity(), histogram)[:2] == (0, 70)
     histogram[3] = 100
-    assert confidence_scale(Ambiguity(), histogram) == (3, 40)
+    assert confidence_scale(Ambiguity(), histogram)[:2] == (3, 40)
+
+
+def test_confidence_scale__keeps_all_but_the_share_of_doubtful_pixels():
+    histogram = np.full(100, 10, np.int64)
+    assert confidence_scale(Ambiguity(), histogram).most == np.inf
+    most = confidence_scale(Ambiguity(), histogram, 0.05).most
+    assert histogram[np.arange(100) > most].sum() == pytest.approx(50, abs=10)
 
 
 def test_normalize__worked_example():
@@ -115,3 +122,18 @@ confidences = st.sampled_from([0, 0.25, 0.5, 0.59, 0.6, 0.61, 0.75, 1, N]).map(n
 def test_low_confidence__equals_reference(confidence, threshold, kernel):
     expected = reference.low_confidence(confidence, threshold, kernel)
     np.testing.assert_array_equal(low_confidence(confidence, threshold, kernel), expected)
+
+
+# ---- Rough winners -------------------------------------------------------------------------------------------
+@few
+@given(data=st.data(), shape=hnp.array_shapes(min_dims=2, max_dims=2, max_side=8))
+def test_rough__equals_a_slow_twin(data, shape):
+    winner = data.draw(hnp.arrays(np.int16, shape, elements=st.integers(-9, 9)))
+    kept = data.draw(hnp.arrays(bool, shape))
+    size, least = data.draw(st.sampled_from([1, 3, 5])), data.draw(st.integers(1, 12))
+    expected = np.zeros(shape, bool)
+    for r, c in np.ndindex(shape):
+        around = tuple(slice(max(0, i - size // 2), i + size // 2 + 1) for i in (r, c))
+        there = winner[around][kept[around]]
+        expected[r, c] = there.size > 0 and np.ptp(there) >= least
+    np.testing.assert_array_equal(rough(winner, kept, size, least), expected)

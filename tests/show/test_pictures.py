@@ -39,7 +39,8 @@ from sat_intervals.show.legend import ORANGE, PIXEL_CLASSES, SKY, VERMILION, cla
 from sat_intervals.show.maps import draw_errors, draw_overview
 from sat_intervals.show.preparation import draw_rows
 from sat_intervals.show.profile import draw_curve, draw_profile
-from sat_intervals.show.surface_map import _relief, draw_surface
+from sat_intervals.show.relief import relief
+from sat_intervals.show.surface_map import draw_surface
 from sat_intervals.tiling import Window
 
 WHITE, GREY = (255, 255, 255), (222, 222, 222)
@@ -294,9 +295,9 @@ def test_draw_surface__without_bounds(tmp_path, words):
 def test_relief__is_bright_where_it_faces_the_sun():
     rows, columns = np.indices((9, 9)) - 4.0
     pyramid = 4 - np.maximum(abs(rows), abs(columns))
-    relief = _relief(pyramid, 1.0, 1.0)
-    north_west, south_east = relief[[1, 4], [4, 1]], relief[[7, 4], [4, 7]]
-    flat = _relief(np.zeros((9, 9)), 1.0, 1.0)
+    shade = relief(pyramid, 1.0, 1.0)
+    north_west, south_east = shade[[1, 4], [4, 1]], shade[[7, 4], [4, 7]]
+    flat = relief(np.zeros((9, 9)), 1.0, 1.0)
     assert np.allclose(flat, np.sqrt(0.5))
     assert (north_west > flat[0, 0]).all()
     assert (south_east < flat[0, 0]).all()
@@ -399,3 +400,16 @@ def test_classify__takes_the_first_reason():
     meanings = [PIXEL_CLASSES[place].meaning for place in classify(validity)]
     assert meanings[:2] == ["valid, high confidence"] * 2
     assert meanings[2:] == ["valid, low confidence", FLAGS[7].meaning, FLAGS[0].meaning]
+
+
+@pytest.mark.peer("shareloc")
+def test_plot__of_many_images_draws_heights_only(swept, words):
+    done = invoke("plot", swept)
+    assert (done.exit_code, done.output.split()) == (0, [str(swept / "dsm.png")]), done.output
+    assert "Height" in words
+    assert not any(re.search(r"px|[Dd]isparit", text) for text in words)
+    for option in (["--row", 3], ["--pixel", 3, 4], ["--beside", swept], ["--truth", swept / "dsm.tif"]):
+        done = invoke("plot", swept, *option)
+        assert done.exit_code == 2
+        assert done.output.count("\n") == 1
+        assert "3 images" in done.output

@@ -156,3 +156,16 @@ def test_project__in_qgis(run, tmp_path):
             colours = picture.convert("RGB").getcolors(1 << 20)
         assert len(colours) > (100 if name == "map" else 1), name  # the half width is 1.5 m everywhere
         assert max(count for count, _ in colours) < 0.9 * 700 * 700, name
+
+
+@pytest.mark.peer("shareloc")
+def test_write_project__of_many_images_has_heights_and_validity(swept):
+    done = invoke("project", swept)
+    assert done.exit_code == 0, done.output
+    assert layers_of(read_project(swept)) == [
+        ("Heights", "half width", "./dsm_half_width.vrt"),
+        ("Heights", "confidence of heights", "./dsm.tif"),
+        ("Heights", "height", "./dsm.tif"),
+        ("Heights", "hillshade", "./dsm.tif"),
+        ("Heights", "validity", "./validity.tif"),
+    ]

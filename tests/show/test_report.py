@@ -125,6 +125,23 @@ def test_write_report__shows_the_main_figures_without_scripts(tmp_path):
     assert page["classes"] == np.bincount(classify(validity).ravel()).tolist()
 
 
+@pytest.mark.peer("shareloc")
+def test_write_report__of_many_images_is_in_metres(swept):
+    path = write_report(open_results(swept))
+    page, report = contents_of(path), json.loads((swept / "run.json").read_text())
+    assert (page["quantity"]["name"], page["quantity"]["unit"], page["name"]) == ("height", "m", "3 images")
+    bands, validity = read_layers(swept / "dsm.tif"), read_layers(swept / "validity.tif")[0]
+    height = np.where(validity & INVALID == 0, bands[0], np.nan)
+    np.testing.assert_allclose(values_of(page, "disparity"), height, atol=0.01)
+    assert page["run"]["inputs"].keys() == {"image_1", "image_2", "image_3"}
+    low, high = report["sweep"]["heights"]
+    text = path.read_text(encoding="utf-8")
+    assert f"<td>{low:.2f} to {high:.2f} m</td>" in text
+    static = re.search(r"<noscript>\n(.*)</noscript>", text, re.DOTALL)[1]
+    assert "fewer than two images see the cell" in static
+    assert not re.search(r"px|[Dd]isparit", static)
+
+
 # ---- In a browser ------------------------------------------------------------------------------------------
 class Page:
     """A report, opened from the disk."""
@@ -273,3 +290,19 @@ def test_page__fits_the_window_and_reads_in_light_and_dark(page, width, scheme):
     ink, paper = (sum(map(int, re.findall(r"\d+", colour))) for colour in colours)
     assert (ink < paper) == (scheme == "light")
     assert abs(ink - paper) > 500
+
+
+@pytest.mark.peer("shareloc")
+def test_page__of_many_images_shows_heights_and_shifts(browser, swept):
+    page = Page(browser, write_report(open_results(swept)))
+    assert page.browser.title == "3 images: height intervals"
+    layers = [label.text for label in page.browser.find_elements("css selector", "#layers label")]
+    assert (
+        layers == ["Hillshade", "Height", "Interval width", "Confidence", "Validity", "Heights searched"][: len(layers)]
+    )
+    assert "Images and heights" in page.text("#search")
+    for image in json.loads((swept / "run.json").read_text())["sweep"]["images"]:
+        assert f"{image['shift'][1]:.2f}".replace("-", "\u2212") in page.text("#search")
+    assert not re.search(r"\bpx\b|[Dd]isparit", page.text("body"))
+    assert not page.find("#command").is_displayed()
+    assert page.complaints() == []

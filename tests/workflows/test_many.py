@@ -1,0 +1,136 @@
+"""Surfaces of many images in one call: accuracy, intervals, equal bytes, deaths, and what is refused."""
+
+import json
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+import rasterio
+from helpers import COMMAND, invoke, refused, wait_until
+from raw import raw_pair
+from sweeps import OPTIONS, WORDS
+
+from sat_intervals import SatIntervalsError
+from sat_intervals.demo import make_scene
+from sat_intervals.products import SURFACE
+from sat_intervals.raster import Georeferencing, read_layers, write_layer
+from sat_intervals.workflows.many import surface_of_many
+
+pytestmark = pytest.mark.peer("shareloc")
+
+
+def files_of(out):
+    return [(out / name).read_bytes() for name in ("dsm.tif", "validity.tif")]
+
+
+def test_surface_of_many__is_near_the_truth_in_most_cells(sweep):
+    height, lower, upper, *_ = read_layers(sweep.out / "dsm.tif").astype(float)
+    scene = np.isfinite(sweep.truth)
+    known = scene & np.isfinite(height)
+    assert known.sum() >= 0.85 * scene.sum()
+    error = (height - sweep.truth)[known]
+    level = np.median(error)  # shifts of the images along the heights are not known
+    assert np.median(np.abs(error - level)) < 0.35
+    assert 0.85 < ((lower - level <= sweep.truth) & (sweep.truth <= upper - level))[known].mean() < 0.97
+
+
+def test_surface_of_many__bands_are_those_of_every_surface(sweep):
+    height, lower, upper, count, confidence, agreement = read_layers(sweep.out / "dsm.tif")
+    known = np.isfinite(height)
+    assert (lower <= height)[known].all()
+    assert (height <= upper)[known].all()
+    assert set(np.unique(count[known])) <= {2, 3, 4, 5}
+    assert ((confidence >= 0) & (confidence <= 1))[known].all()
+    for band in (lower, upper, count, confidence):
+        assert np.isnan(band[~known]).all()
+    assert np.isnan(agreement).all()
+    with rasterio.open(sweep.out / "dsm.tif") as surface, rasterio.open(sweep.out / "validity.tif") as validity:
+        tags = surface.tags()
+        assert surface.descriptions == tuple(band.name for band in SURFACE)
+        assert (surface.transform, surface.crs) == (validity.transform, validity.crs)
+    assert {"IMAGES": "5", "COVERAGE": "0.9", "HEIGHTS": "above the WGS 84 ellipsoid"}.items() <= tags.items()
+    assert tags["DISPARITY_CALIBRATION"].startswith("many ")
+    assert sweep.report["counts"]["valid"] == known.sum()
+
+
+def test_surface_of_many__has_the_same_bytes_for_any_tiles_and_says_that_it_was_complete(sweep, tmp_path, caplog):
+    out, settings = tmp_path / "out", {"preset": "many", "tiles": {"size": 64}}
+    report = surface_of_many(sweep.images, out, settings, **OPTIONS, keep_tiles=True)
+    assert (out / "tiles" / "tiles").is_dir()
+    assert files_of(out) == files_of(sweep.out)
+    assert json.loads((out / "run.json").read_text()) == report
+    assert surface_of_many(sweep.images, out, settings, **OPTIONS) == report
+    assert f"the run in {out} was already complete" in caplog.text
+    assert "complete" in invoke("status", out).stdout
+    assert not (out / "tiles").exists()
+    (out / "dsm.tif").unlink()
+    with pytest.raises(SatIntervalsError, match=r"dsm.tif"):
+        surface_of_many(sweep.images, out, settings, **OPTIONS)
+
+
+@pytest.mark.process
+def test_surface_of_many__survives_kill_9_and_has_the_same_bytes_on_processes(sweep, tmp_path):
+    out = tmp_path / "out"
+    words = ["surface", *sweep.images, out, *WORDS, "--tile-size", 64, "--cluster", "processes", "--workers", 2]
+    command = [str(word) for word in (COMMAND, *words, "--quiet", "--keep-tiles")]
+
+    def done():
+        return {file.name: file.stat().st_mtime_ns for file in (out / "tiles" / "tiles").glob("[0-9]*.npz")}
+
+    process = subprocess.Popen(command)
+    try:
+        wait_until(lambda: len(done()) >= 2 or process.poll() is not None, "two tiles")
+        assert process.poll() is None
+    finally:
+        process.kill()
+        process.wait()
+    before = done()
+    assert not (out / "dsm.tif").exists()
+    subprocess.run(command, check=True)
+    assert before.items() <= done().items(), "tiles done twice"
+    assert files_of(out) == files_of(sweep.out)
+
+
+def test_surface_of_many__refuses_what_it_cannot_use(sweep, tmp_path):
+    out = tmp_path / "out"
+    with pytest.raises(SatIntervalsError, match="2 images are given: give three or more"):
+        surface_of_many(sweep.images[:2], out, **OPTIONS)
+    with pytest.raises(SatIntervalsError, match=r"cost.method is census, .* compares two images: give --preset many"):
+        surface_of_many(sweep.images, out, {"preset": "satellite"}, **OPTIONS)
+    own = tmp_path / "dsm.tif"
+    shutil.copy(sweep.images[3], own)
+    with pytest.raises(SatIntervalsError, match=r"dsm.tif is .*input"):
+        surface_of_many([*sweep.images[:3], own], tmp_path, **OPTIONS, overwrite=True)
+    bare = tmp_path / "bare.tif"
+    write_layer(bare, read_layers(sweep.images[0])[0], 0, Georeferencing())
+    refused(
+        ("surface", *sweep.images[:2], bare, out, *WORDS),
+        f"{bare} has no RPC model in its tags or beside it: give an image with one",
+    )
+    refused(("surface", *sweep.images, sweep.images[0], out, *WORDS), f"{sweep.images[0]} is given twice")
+    refused(("surface", *sweep.images, out, *WORDS, "--heights", 50, 0), "heights are 50 to 0 m: give the lowest one")
+    refused(("surface", *sweep.images, sweep.out, *WORDS, "--tile-size", 64), "--overwrite")
+    assert not out.exists() or not list(out.glob("*.tif"))
+
+
+def test_surface__of_many_refuses_options_of_pairs(sweep, tmp_path):
+    command = "surface", *sweep.images[:3], tmp_path / "out", *WORDS
+    model = ("--left-model", "a", "--right-model", "b")
+    given = model, ("--window", 0, 0, 50, 50), ("--radius", 2), ("--altitude", 20), ("--nodata", "0,1")
+    for words in given:
+        refused((*command, *words), f"{words[0]}", " is for two images: leave it out")
+    refused((*command, "--disparity", 0, 9), "a search range in pixels is for two images: leave it out")
+    refused((*command, "--outliers", 2), "an option for points is for two images: leave it out")
+    refused((*command, "--preset", "satellite"), "cost.method is census, which compares two images: give --preset many")
+
+
+def test_surface__of_two_images_goes_the_way_of_pairs(tmp_path):
+    images = raw_pair(tmp_path / "raw", make_scene(120, 150, seed=4))
+    command = "surface", *images, tmp_path / "out", "--resolution", 1
+    refused((*command, "--heights", 0, 50), "--heights is for three images or more")
+    refused((*command, "--preset", "many"), "compares many images")
+    assert not (tmp_path / "out").exists()
+    result = invoke(*command, "--altitude", 20)
+    assert result.exit_code == 0, result.output
+    assert {"left.tif", "right.tif", "intervals.tif", "dsm.tif"} <= {path.name for path in (tmp_path / "out").iterdir()}
