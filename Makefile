@@ -64,8 +64,9 @@ surface-bounds: $(VENV)/.has-dsm
 coverage: $(VENV)/.has-mccnn
 	$(BIN)/python -W ignore tests/benchmarks/coverage_tables.py
 
-# The pictures of README.md and docs; 256 colours keep them small. RAW is the folder of a raw pair.
+# The pictures of README.md and docs; 256 colours keep them small. RAW is the folder of a raw pair, MANY of raw images.
 RAW ?= $(SAT_INTERVALS_SHARED)/data/raw_picanteo_pre
+MANY ?= $(SAT_INTERVALS_SHARED)/data/jax_068
 pictures: $(VENV)/.has-dsm,plot
 	$(BIN)/sat-intervals demo demo-out --overwrite --quiet
 	$(BIN)/python docs/pictures/demo_cameras.py demo-out
@@ -77,7 +78,10 @@ pictures: $(VENV)/.has-dsm,plot
 	$(BIN)/python docs/pictures/rows.py demo-out/rows.png
 	$(BIN)/sat-intervals surface $(RAW)/left.tif $(RAW)/right.tif demo-out/raw --resolution 1 --overwrite --quiet
 	$(BIN)/python docs/pictures/surface.py demo-out/raw demo-out/surface.png
-	for name in overview profile wavefronts staircase rows surface; do $(BIN)/python -c 'import sys; from PIL import Image; Image.open(sys.argv[1]).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(sys.argv[2], optimize=True)' demo-out/$$name.png .github/pictures/$$name.png; done
+	$(BIN)/sat-intervals surface $(MANY)/003.tif $(MANY)/004.tif demo-out/two --resolution 0.5 --band 2 --overwrite --quiet
+	$(BIN)/sat-intervals surface $(sort $(wildcard $(MANY)/0*.tif)) demo-out/many --resolution 0.5 --band 2 --overwrite --quiet
+	$(BIN)/python docs/pictures/many.py $(MANY)/lidar_west.tif demo-out/two demo-out/many demo-out/many.png
+	for name in overview profile wavefronts staircase rows surface many; do $(BIN)/python -c 'import sys; from PIL import Image; Image.open(sys.argv[1]).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(sys.argv[2], optimize=True)' demo-out/$$name.png .github/pictures/$$name.png; done
 
 # The documentation site, in site/; a warning is an error. Pictures of the gallery are made by running the commands.
 docs: $(VENV)/.has-docs,dsm,plot
