@@ -142,7 +142,7 @@ class Console:
         cells, step = swept["cells"], swept["step"]
         images = Table("image", "row", "column", "likeness", box=None, pad_edge=False)
         for one in swept["images"]:
-            images.add_row(Path(one["path"]).name, *(f"{part:+.2f}" for part in one["shift"]), f"{one['alike']:.2f}")
+            images.add_row(Path(one["path"]).name, *(f"{part:+.2f}" for part in one["shift"]), _likeness(one["alike"]))
         self.say("shifts of the models (px), and likeness to the other images (-1 to 1)")
         self._terminal.print(images)
         table = Table(show_header=False, box=None, pad_edge=False)
@@ -180,6 +180,10 @@ class Console:
             table.add_row(*row, str(len(end.get("warnings", ()))) if counts else "")
         self._terminal.print(table)
         warn(f"{name}: {line}" for name, end in report.items() for line in end.get("warnings", ()))
+
+
+def _likeness(alike: float | None) -> str:
+    return "-" if alike is None else f"{alike:.2f}"
 
 
 def _share(part: int, whole: int) -> str:

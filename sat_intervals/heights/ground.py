@@ -6,13 +6,18 @@ from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
-from scipy.ndimage import map_coordinates
 
+from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.epipolar import MARGIN, STEP, shareloc_grids
 from sat_intervals.heights.models import SensorImage, common_heights, common_parts
 from sat_intervals.match.coarse import Step, match_level, reduced
 from sat_intervals.raster import BLOCK, read_window
 from sat_intervals.tiling import Window
+
+try:
+    from scipy.ndimage import map_coordinates
+except ModuleNotFoundError as error:
+    raise SatIntervalsError("sensor models need shareloc: pip install 'sat-intervals[dsm]'") from error
 
 # Side of the reduced images at most, and at least that of the smaller one, in pixels; reduction at least: rows of
 # models are off by some pixels.

@@ -4,11 +4,15 @@ import warnings
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import RegularGridInterpolator
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.sensors import Sensors
 from sat_intervals.raster import Projection, between_180
+
+try:
+    from scipy.interpolate import RegularGridInterpolator
+except ModuleNotFoundError as error:
+    raise SatIntervalsError("sensor models need shareloc: pip install 'sat-intervals[dsm]'") from error
 
 # Largest error of the inverse of a grid in sensor pixels, and iterations: a grid is affine but for a thousandth.
 _NEAR, _MOST = 1e-6, 30

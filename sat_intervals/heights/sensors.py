@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import RegularGridInterpolator
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.lattice import Lattice
@@ -19,6 +18,11 @@ from sat_intervals.kernels.row_offsets import RowOffsets
 from sat_intervals.progress import Progress
 from sat_intervals.raster import GROUND, Georeferencing, between_180, read_known, read_tags
 from sat_intervals.tiling import Window
+
+try:
+    from scipy.interpolate import RegularGridInterpolator
+except ModuleNotFoundError as error:
+    raise SatIntervalsError("sensor models need shareloc: pip install 'sat-intervals[dsm]'") from error
 
 with kernels_of_others():
     from affine import Affine

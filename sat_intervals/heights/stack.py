@@ -5,20 +5,25 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import maximum_filter, minimum_filter, shift, uniform_filter
 
 from sat_intervals.config import Config
+from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.disparity import median
 from sat_intervals.kernels.resampling import resample
 from sat_intervals.kernels.row_offsets import AFTER, BEFORE
-from sat_intervals.match.ground import BLOCK, GroundViews
+from sat_intervals.match.ground import BLOCK, GroundViews, reduced
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.matching_cost import Given
 from sat_intervals.match.patch import PatchFrame, match_patch, patch_areas
 from sat_intervals.match.sweep import SweepCost
 from sat_intervals.prepare.pair import Each
-from sat_intervals.raster import Image, read_views
+from sat_intervals.raster import Image, read_window
 from sat_intervals.tiling import Grid, View, Window
+
+try:
+    from scipy.ndimage import maximum_filter, minimum_filter, shift, uniform_filter
+except ModuleNotFoundError as error:
+    raise SatIntervalsError("sensor models need shareloc: pip install 'sat-intervals[dsm]'") from error
 
 # Cells of a tile of a level, and around it that support it.
 _TILE, _OVERLAP = 256, 16
@@ -29,6 +34,10 @@ _UNSURE = 0.1, 0.3
 _BESIDE, _MARGIN = 4, (2, 0.1)
 # Sample blocks for shifts along each side of the grid, and their side in cells.
 _SAMPLES, _SIDE = 3, 96
+# Pixels of an image that are read at once.
+_STRIP = 1 << 24
+# Cells of sample blocks that an image must show to be compared with the others.
+_FEWEST = 500
 # Cells over which grey values are made alike.
 _LOCAL = 9
 # Side in cells of the windows, and the most steps of height between their cells, that shifts are found in.
@@ -89,12 +98,25 @@ def _matched(stack: Stack, core: Window) -> tuple[Surface, list[View]]:
     frame = PatchFrame(core, stack.whole, stack.whole)
     cost = SweepCost(stack.config, Given(ground=stack.ground, ranges=stack.ranges))
     areas = patch_areas(frame, stack.config, stack.ranges)
-    views = read_views(stack.images, cost.windows(areas))
-    patch = match_patch(frame, cost.of_areas(views, areas), stack.config, ranges=stack.ranges)
+    images = [_read(*one) for one in zip(stack.images, cost.windows(areas), stack.ground.reductions, strict=True)]
+    patch = match_patch(frame, cost.of_reduced(images, areas), stack.config, ranges=stack.ranges)
     inner = core.relative_to(patch.output).slices
     disparity, ambiguity = patch.raw.disparity[inner], patch.raw.ambiguity[inner]
     surface = Surface(disparity, (ambiguity / stack.config.largest_ambiguity).astype(np.float32))
-    return surface, stack.ground.usable(views)
+    return surface, images
+
+
+def _read(image: Image, window: Window, reduction: int) -> View:
+    """Read a window of an image, reduced, in strips of rows: a whole image would not fit in memory."""
+    place = Window(*(part // reduction for part in (window.row, window.column, window.height, window.width)))
+    pixels = np.full((place.height, place.width), np.float32(np.nan))
+    rows = max(1, _STRIP // (reduction**2 * max(1, place.width)))
+    first, last = max(0, -place.row), min(place.height, -(-image.height // reduction) - place.row)
+    for row in range(first, last, rows):
+        height = min(rows, last - row)
+        strip = Window(window.row + row * reduction, window.column, height * reduction, window.width)
+        pixels[row : row + height] = reduced(*read_window(image, strip), reduction)
+    return View(place, pixels, np.zeros((0, 0), np.uint8))
 
 
 def surface_of(stack: Stack, each: Each) -> Surface:
@@ -192,16 +214,19 @@ def aligned(stack: Stack, samples: Sequence[Sample]) -> tuple[np.ndarray, np.nda
 
 
 def _correlations(samples: Sequence[Sample]) -> np.ndarray:
+    """Return the correlation of each image with the median of the others, NaN where it shows too few cells."""
     products = []
     for one in samples:
         for n, own in enumerate(one.alike):
             middle = median_of(np.delete(one.alike, n, axis=0))
             seen = one.sure & np.isfinite(own) & np.isfinite(middle)
-            products.append((n, (own * middle)[seen].sum(), (own**2)[seen].sum(), (middle**2)[seen].sum()))
-    sums = np.zeros((len(samples[0].alike), 3))
+            of_cells = (own * middle)[seen].sum(), (own**2)[seen].sum(), (middle**2)[seen].sum(), seen.sum()
+            products.append((n, *of_cells))
+    sums = np.zeros((len(samples[0].alike), 4))
     for n, *parts in products:
         sums[n] += parts
-    return np.asarray(sums[:, 0] / np.sqrt(np.maximum(sums[:, 1] * sums[:, 2], 1e-9)))
+    found = sums[:, 0] / np.sqrt(np.maximum(sums[:, 1] * sums[:, 2], 1e-9))
+    return np.where(sums[:, 3] >= _FEWEST, found, np.nan)
 
 
 def _equations(one: Sample, shifts: np.ndarray) -> np.ndarray:

@@ -113,7 +113,8 @@ def _footprint(images: Sequence[SensorImage], projection: Projection, heights: t
         )
         row, column = (axis.ravel() for axis in np.meshgrid(rows, columns, indexing="ij"))
         for height in heights:
-            points = one.model.direct_loc_h(row, column, np.full(row.size, height))
+            up = projection.undulation(np.array([one.model.offset_x]), np.array([one.model.offset_y]))
+            points = one.model.direct_loc_h(row, column, np.full(row.size, height + float(up[0])))
             corners.append(np.stack(projection.place(points[:, 0], points[:, 1])))
     x, y = np.concatenate(corners, axis=1)
     return Extent(float(x.min()), float(y.min()), float(x.max()), float(y.max()))

@@ -90,7 +90,7 @@ def _pair_costs(words, seen, pairs, share, steps, lowest, costs):
     """
     rows, columns = costs.shape
     most = lowest.shape[0] - 1
-    found, new = np.empty(columns, np.uint8), lowest[most]
+    found, new = np.empty(columns, np.uint16), lowest[most]
     for r in range(rows):
         found[:] = 0
         lowest[:most] = _UNSEEN

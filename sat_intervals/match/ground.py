@@ -138,10 +138,8 @@ class GroundViews:
         """Return the reduced images, float32, with NaN where not usable; their windows count reduced pixels."""
         found = []
         for view, reduction in zip(views, self.reductions, strict=True):
-            window = view.window
-            pixels = np.where(view.state == 0, view.pixels, np.nan).astype(np.float32)
-            pixels = pixels.reshape(window.height // reduction, reduction, -1, reduction).mean(axis=(1, 3))
-            place = Window(window.row // reduction, window.column // reduction, *pixels.shape)
+            pixels = reduced(view.pixels, view.state, reduction)
+            place = Window(view.window.row // reduction, view.window.column // reduction, *pixels.shape)
             found.append(View(place, pixels, view.state))
         return found
 
@@ -175,6 +173,12 @@ def _fine(view: View, nodes: np.ndarray, first: np.ndarray, begin: np.ndarray, s
             pixels, (around.row, around.column), nodes, FINE * _NODES, tuple(map(int, start)), *map(int, FINE * size)
         )
     )
+
+
+def reduced(pixels: np.ndarray, state: np.ndarray, reduction: int) -> np.ndarray:
+    """Return means of square blocks, float32, NaN where a pixel is not usable; sides are multiples of ``reduction``."""
+    usable = np.where(state == 0, pixels, np.nan).astype(np.float32)
+    return np.asarray(usable.reshape(len(usable) // reduction, reduction, -1, reduction).mean(axis=(1, 3)))
 
 
 def ground_of(report: dict[str, Any], arrays: Sequence[np.ndarray]) -> GroundViews:

@@ -41,8 +41,13 @@ class SweepCost(MatchingCost):
         self, views: Views, areas: Sequence[Area], made: Sequence[np.ndarray] | None = None
     ) -> list[AreaCosts]:
         """Compute the costs of areas, in blocks; candidates outside a block's range get the largest."""
-        usable = self._ground.usable(views)
-        return [self._of_area(usable, area, made[i] if made else None) for i, area in enumerate(areas)]
+        return self.of_reduced(self._ground.usable(views), areas, made)
+
+    def of_reduced(
+        self, images: Sequence[View], areas: Sequence[Area], made: Sequence[np.ndarray] | None = None
+    ) -> list[AreaCosts]:
+        """Compute the costs of areas from reduced images, see `GroundViews.usable`."""
+        return [self._of_area(images, area, made[i] if made else None) for i, area in enumerate(areas)]
 
     def _of_area(self, images: Sequence[View], area: Area, made: np.ndarray | None) -> AreaCosts:
         shape, largest = (area.base.height, area.base.width), self._config.numbers.largest

@@ -117,7 +117,7 @@ def found_ground(
     """
     search, left_out = _Search(sensors, projection, config, each), list[SensorImage]()
     while True:
-        domain = heights or _domain(search.sensors)
+        domain = heights or _domain(search.sensors, projection)
         cells = grid or common_cells(search.sensors, projection, domain, resolution)
         found = heights
         if found is None:
@@ -125,7 +125,7 @@ def found_ground(
             found = _heights_of(surface_of(top, each), top, domain)
             cells = grid or common_cells(search.sensors, projection, found, resolution)
         stack = search.descend(cells, found)
-        unlike = search.alike < _UNLIKE * np.median(search.alike)
+        unlike = search.alike < _UNLIKE * np.nanmedian(search.alike)  # not those that show too few of the samples
         if not unlike.any():
             break
         left_out += [one for one, is_unlike in zip(search.sensors, unlike, strict=True) if is_unlike]
@@ -140,11 +140,14 @@ def found_ground(
     return GroundPlan(search.sensors, left_out, cells, stack.ground, config, stack.ranges, search.shifts, search.alike)
 
 
-def _domain(sensors: Sequence[SensorImage]) -> tuple[float, float]:
+def _domain(sensors: Sequence[SensorImage], projection: Projection) -> tuple[float, float]:
+    """Return the heights that all models have in common, above the geoid if there is one."""
     lowest, highest = (max(one.heights[0] for one in sensors), min(one.heights[1] for one in sensors))
     if lowest >= highest:
         raise SatIntervalsError("the models of the images have no heights in common: give heights")
-    return lowest, highest
+    middle = sensors[0].model
+    up = float(projection.undulation(np.array([middle.offset_x]), np.array([middle.offset_y]))[0])
+    return lowest - up, highest - up
 
 
 def _factors(cells: Cells) -> list[int]:
@@ -155,6 +158,10 @@ def _factors(cells: Cells) -> list[int]:
 def _heights_of(surface: Surface, stack: Stack, domain: tuple[float, float]) -> tuple[float, float]:
     """Return the range of the heights of most cells of a level, in metres."""
     found = surface.disparity[surface.sure(0.3)]
+    if not found.size:
+        raise SatIntervalsError(
+            "nowhere on the grid do two images show the same ground: check the grid, no-data values and masks"
+        )
     low, high = np.quantile(found, [_BEYOND, 1 - _BEYOND])
     margin = _MARGIN[0] + _MARGIN[1] * (high - low)
     ground = stack.ground

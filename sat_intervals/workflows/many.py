@@ -17,7 +17,8 @@ from sat_intervals.prepare.prepared import Prepared
 from sat_intervals.products import plain
 from sat_intervals.progress import Progress, logged_stage
 from sat_intervals.raster import Image, Projection, north_up, open_image, utm_of
-from sat_intervals.raster.identity import check_not_replaced, identities
+from sat_intervals.raster.identity import check_not_replaced, identities, identity
+from sat_intervals.raster.publishing import check_free
 from sat_intervals.results import open_run
 from sat_intervals.run.assemble import end_tiles
 from sat_intervals.run.connection import Connection
@@ -30,6 +31,8 @@ from sat_intervals.store.lock import locked
 from sat_intervals.store.manifest import digest
 from sat_intervals.store.tiles import home_of
 from sat_intervals.tiling import Window
+
+ORTHO = "ortho.tif"
 
 _LOG = logging.getLogger(__name__)
 
@@ -100,8 +103,6 @@ def surface_of_many(
         Tiles failed; no output was published.
     """
     from sat_intervals.heights.dsm import checked_cells
-    from sat_intervals.workflows.ortho import NAME as ORTHO
-    from sat_intervals.workflows.ortho import write_ortho
 
     out, geoid = Path(out), None if geoid is None else Path(geoid)
     config = resolved(load_config(config, {"preset": "many"} if config is None else None))
@@ -125,11 +126,14 @@ def surface_of_many(
                 "made_by": [version("sat-intervals"), FINGERPRINT],
                 "inputs": inputs,
                 "settings": config.model_dump(mode="json", exclude={"cluster", "tiles", "products", "preset"}),
-                "given": [cell, grid and asdict(grid), crs, str(geoid), heights, list(map(str, models))],
+                "given": [cell, grid and asdict(grid), crs, heights],
+                "files": [file and identity(str(file), {}) for file in (geoid, *models)],
             }
         )
     )
     request = digest([asked, config.model_dump(mode="json", exclude={"cluster", "preset"})])
+    if makes_ortho and read_report(out) is None:
+        check_free(out / ORTHO, overwrite=overwrite)
     is_made = not makes_ortho or (out / ORTHO).exists()
     if is_made and not overwrite and (before := _complete_before(out, request, keep_tiles=keep_tiles)):
         return before
@@ -149,7 +153,9 @@ def surface_of_many(
         with locked(out):
             report = complete_before(job) if not job.begin() else match_and_assemble(job, connection, seconds, progress)
             if makes_ortho:
-                write_ortho(job, ground, progress)
+                from sat_intervals.workflows.ortho import write_ortho
+
+                write_ortho(job, ground, ORTHO, progress)
             end_tiles(job, keep_tiles=keep_tiles)
     return report
 

@@ -1,12 +1,21 @@
 """Shifts of images that are known."""
 
+from contextlib import suppress
+
 import numpy as np
-from scipy.ndimage import gaussian_filter
-from scipy.ndimage import shift as shifted
+import pytest
 
 from sat_intervals.config import load_config
-from sat_intervals.heights.stack import Sample, Stack, aligned
+from sat_intervals.errors import SatIntervalsError
 from sat_intervals.match.ground import GroundViews
+
+with suppress(ModuleNotFoundError, SatIntervalsError):  # without shareloc all tests here are skipped
+    from scipy.ndimage import gaussian_filter
+    from scipy.ndimage import shift as shifted
+
+    from sat_intervals.heights.stack import Sample, Stack, aligned
+
+pytestmark = pytest.mark.peer("shareloc")
 
 
 def test_aligned__finds_shifts_of_images_of_which_one_is_turned():
