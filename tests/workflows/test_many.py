@@ -120,7 +120,7 @@ def test_surface__of_many_refuses_options_of_pairs(sweep, tmp_path):
     given = model, ("--window", 0, 0, 50, 50), ("--radius", 2), ("--altitude", 20), ("--nodata", "0,1")
     for words in given:
         refused((*command, *words), f"{words[0]}", " is for two images: leave it out")
-    refused((*command, "--disparity", 0, 9), "a search range in pixels is for two images: leave it out")
+    refused((*command, "--disparity", 0, 9), "--disparity is for two images: leave it out")
     refused((*command, "--outliers", 2), "an option for points is for two images: leave it out")
     refused((*command, "--preset", "satellite"), "cost.method is census, which compares two images: give --preset many")
 
@@ -128,7 +128,7 @@ def test_surface__of_many_refuses_options_of_pairs(sweep, tmp_path):
 def test_surface__of_two_images_goes_the_way_of_pairs(tmp_path):
     images = raw_pair(tmp_path / "raw", make_scene(120, 150, seed=4))
     command = "surface", *images, tmp_path / "out", "--resolution", 1
-    refused((*command, "--heights", 0, 50), "--heights is for three images or more")
+    refused((*command, "--heights", 0, 50), "--heights and --ortho are for three images or more")
     refused((*command, "--preset", "many"), "compares many images")
     assert not (tmp_path / "out").exists()
     result = invoke(*command, "--altitude", 20)
