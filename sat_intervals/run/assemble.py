@@ -104,7 +104,9 @@ def _copy_parts(
     job: Job, writer: OutputWriter, metas: Mapping[PartKey, Mapping[str, Any]], workers: Workers, progress: Progress
 ) -> None:
     """Copy the finished parts of a run into its files, on workers that share its folder, else in this process."""
-    files, of, retries = files_of_run(job.config), parts_of(job), job.config.cluster.retries
+    files = files_of_run(job.config)
+    of = parts_of(job)
+    retries = job.config.cluster.retries
     copied: list[str | None] = []
     with nullcontext(workers) if job.is_home else closing(Threads(_THREADS)) as copiers:
 

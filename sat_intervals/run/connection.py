@@ -15,7 +15,9 @@ class Connection(ExitStack):
     def __init__(self, settings: Cluster, out: Path) -> None:
         """``out`` is the folder for logs of jobs."""
         super().__init__()
-        self._settings, self._out, self._lock = settings, out, Lock()
+        self._settings = settings
+        self._out = out
+        self._lock = Lock()
         self._workers: Workers | None = None
 
     def outcomes(self, tasks: Iterator[Task | None]) -> Iterator[Outcome | None]:

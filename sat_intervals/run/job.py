@@ -317,7 +317,9 @@ def _identity(ground: GroundViews) -> dict[str, Any]:
 
 def _manifest(prepared: Prepared[FilePair], inputs: Mapping[str, Any], region: Window) -> dict[str, Any]:
     """Return all that decides the bytes of a tile; of a calibration only its levels."""
-    config, ranges, rows = prepared.config, prepared.ranges, prepared.rows
+    config = prepared.config
+    ranges = prepared.ranges
+    rows = prepared.rows
     settings = config.model_dump(mode="json", exclude=_NOT_OF_TILES)
     levels = config.cuts
     if levels is not None:

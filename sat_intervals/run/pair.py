@@ -16,6 +16,7 @@ from sat_intervals.progress import Progress, add_seconds, logged_stage
 from sat_intervals.raster import Image
 from sat_intervals.results import open_run
 from sat_intervals.run.assemble import assemble, end_tiles
+from sat_intervals.run.beside import compiled_beside
 from sat_intervals.run.connection import Connection
 from sat_intervals.run.each import EachOnWorkers
 from sat_intervals.run.job import Job, open_job
@@ -84,7 +85,7 @@ def match_pair(
     """
     config, out = _named(load_config(config), volume_of), Path(out)
     seconds: dict[str, float] = {}
-    with Connection(config.cluster, out) as connection:
+    with compiled_beside(config), Connection(config.cluster, out) as connection:
         with logged_stage(seconds, "start"):
             each = EachOnWorkers(connection, progress)
             job = open_job(left, right, out, config, window=window, overwrite=overwrite, each=each)

@@ -70,7 +70,9 @@ def doubts_of_images(left: Image, right: Image, looked: Mapping[str, Any] | None
 
 def _no_data(job: Job, tables: Tables) -> dict[str, float]:
     """Return the share of pixels without data among those that tiles have read, by side."""
-    read, usable, ranges = Counter[str](), Counter[str](), job.ranges()
+    read = Counter[str]()
+    usable = Counter[str]()
+    ranges = job.ranges()
     for tile in job.store.grid:
         windows = view_windows(patch_areas(frame_of(job, tile), job.config, ranges), job.config)
         for side, image, window in zip(("left", "right"), (job.left, job.right), windows, strict=True):
@@ -112,7 +114,9 @@ def warnings_of(job: Job, counts: Mapping[str, Any], quality: Mapping[str, Any])
             for path in job.swept.report["left_out"]
         ]
         return [*lines, *([f"{job.out}: {missed}"] if (missed := unreached(job.config)) else [])]
-    paths, config, survey = (job.left.path, job.right.path), job.config, job.prepared.survey
+    paths = (job.left.path, job.right.path)
+    config = job.config
+    survey = job.prepared.survey
     of_data = [*doubts_of_images(job.left, job.right, quality), *_spoiled(job, counts, quality["no_data"]["left"])]
     rows = rows_left(survey, config.rows, job.right.path)
     was_found = job.prepared.search is not None

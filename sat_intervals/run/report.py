@@ -81,7 +81,8 @@ def report_of(
     job: Job, tables: Tables, scale: ConfidenceScale, parts: Iterable[Mapping[str, Any]], seconds: dict[str, float]
 ) -> dict[str, Any]:
     """Return the content of run.json."""
-    grid, config, prepared = job.store.grid, job.config, job.prepared
+    grid = job.store.grid
+    config, prepared = job.config, job.prepared
     tally = Tally(config.disparity.count, config.disparity.minimum)
     for part in parts:
         tally.merge(part.get("counts", {}))

@@ -126,7 +126,9 @@ def finish_strip(job: Job, of: str, key: PartKey, scale: ConfidenceScale) -> str
     # also while it reads and writes: more strips at once would need more memory than `check_tiles` allows for
     with picklable_errors(), computing(job.config.cluster):
         check_codecs(job, of)
-        region, search, margin = job.store.grid.region, job.config.disparity, halo(job.config)
+        region = job.store.grid.region
+        search = job.config.disparity
+        margin = halo(job.config)
         first, last = key[1] * BLOCK, min(region.height, (key[1] + 1) * BLOCK)
         top, bottom = max(0, first - margin), min(region.height, last + margin)
         shape, extra = (last - first, region.width), job.config.extra_bands
