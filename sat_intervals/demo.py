@@ -30,7 +30,9 @@ SAMPLES = 96  # positions along a side at which a mountain is measured
 STEP = 0.8  # m between adjacent nodes that form a wall
 SLOPE_LIGHT = (0.5, 0.65)  # shading of slopes along columns and rows: sun in the upper left, 50 degrees high
 LIGHTS = (0.3, 1.8)  # least and largest shading of slopes
-SHADOW_SHIFT, SHADOW_DROP, AMBIENT = 3, 0.75, 0.25  # nodes and m per row; share of light in a shadow
+SHADOW_SHIFT = 3  # nodes a row
+SHADOW_DROP = 0.75  # m a row
+AMBIENT = 0.25  # share of light in a shadow
 OFFSET, GAIN = np.array([[90, 62], [2400, 2570]])  # DN = offset + gain * radiance; left, right
 MID_LEVEL, SATURATION = 600.0, 4095  # DN at which the signal to noise ratio is defined; 12 bits
 CORNER = (0.32, 0.13)  # legs of the empty corner as shares of rows and columns
@@ -276,7 +278,9 @@ def _surface(ground: Ground, rows: Array, columns: int) -> Array:
     """Return height (m) and albedo (shaded by slope) of the nodes of some rows: (2, rows, nodes)."""
     lattice, margin = ground.lattice, ground.margin
     r, c = np.append(rows, rows[-1] + 1.0)[:, None], np.arange(-margin, columns + margin + 2.0)[None]
-    height, grain, quarter = _terrain(ground, r, c), _noise(lattice, r, c, 4, 2), _quarter(lattice, r, c)
+    height = _terrain(ground, r, c)
+    grain = _noise(lattice, r, c, 4, 2)
+    quarter = _quarter(lattice, r, c)
     albedo = np.where(height > 0, _ground(lattice, r, c, grain, quarter), 0.07 + 0.0015 * grain)
     along, down = np.diff(height)[:-1] / PIXEL, np.diff(height, axis=0)[:, :-1] / PIXEL
     albedo[:-1, :-1] *= np.clip(1 + SLOPE_LIGHT[0] * along + SLOPE_LIGHT[1] * down, *LIGHTS)

@@ -139,7 +139,9 @@ class Run:
 
     def layer(self, path: str | Path) -> Layer:
         """Open another raster of the same pixels, such as the truth."""
-        image, left, here = open_image(path), self.report["inputs"]["left"], self.region.in_words
+        image = open_image(path)
+        left = self.report["inputs"]["left"]
+        here = self.region.in_words
         size, there = (image.height, image.width), tags_beside(image.path, left).get("REGION", here)
         if size == self.shape:
             if there != here:
@@ -246,7 +248,9 @@ def open_results(out: str | Path, truth: str | Path | None = None) -> Results:
 
 def open_input(record: dict[str, Any]) -> Image:
     """Reopen an input image of a run, from its report."""
-    name, mask, nodata = record["path"], record["mask"], record["nodata"]
+    name = record["path"]
+    mask = record["mask"]
+    nodata = record["nodata"]
     if name.startswith("/") and not name.startswith("/vsi") and not Path(name).exists():
         raise SatIntervalsError(f"{name}, an image of the run, is missing: move it back, or put a link to it there")
     nodata = None if nodata is None else float(nodata)

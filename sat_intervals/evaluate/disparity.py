@@ -81,7 +81,9 @@ def evaluate_run(
 
 def criteria_of(config: Config, tolerance: float = 0.0) -> Criteria:
     """Return the criteria for a run; without regularisation, low confidence follows the default settings."""
-    low, search, interval = config.regularization or Regularization(), config.disparity, config.interval
+    low = config.regularization or Regularization()
+    search = config.disparity
+    interval = config.interval
     level = None if interval is None else interval.coverage or interval.alpha
     nominal = None if level is None else float(level)
     return Criteria(search.minimum, search.maximum, low.threshold, low.kernel, low.depth, tolerance, nominal=nominal)

@@ -11,7 +11,10 @@ import numpy as np
 from sat_intervals.match.histogram import Histogram
 from sat_intervals.products import Bands
 
-_WIDTH, _RATIO, _CONFIDENCE = 100, 1000, 1000  # steps a unit
+# Steps a unit.
+_WIDTH = 100
+_RATIO = 1000
+_CONFIDENCE = 1000
 _LARGEST_RATIO = 100
 
 
@@ -97,7 +100,9 @@ class _Locking:
     """How much more often disparities are near whole pixels than truths: 0 alike, 1 whole pixels only."""
 
     def __init__(self) -> None:
-        self._count, self._disparity, self._truth = 0, 0.0, 0.0
+        self._count = 0
+        self._disparity = 0.0
+        self._truth = 0.0
 
     def add(self, disparity: np.ndarray, truth: np.ndarray) -> None:
         near = np.abs(disparity - truth) <= 1
@@ -131,7 +136,9 @@ class Metrics:
         """
         disparity, lower, upper, confidence, _, truth, *_ = bands
         criteria = self._criteria
-        lowest, highest, width = lower - criteria.tolerance, upper + criteria.tolerance, upper - lower
+        lowest = lower - criteria.tolerance
+        highest = upper + criteria.tolerance
+        width = upper - lower
         missed = np.maximum(np.maximum(lowest - truth, truth - highest), 0)
         for name, chosen in (("all", np.ones_like(low)), ("high", ~low), ("low", low)):
             self._areas[name].add(missed[chosen], width[chosen])

@@ -122,7 +122,10 @@ def _coarser(given: Comparison) -> float:
 def _sample(given: Comparison) -> tuple[Heights, np.ndarray, float]:
     """Return heights, `_MOST` at most by chance, the block of ground of each, and the cells that one stands for."""
     random = np.random.default_rng(0)
-    parts, common, gathered, share = [np.empty((6, 0))], 0, 0, 1.0
+    parts = [np.empty((6, 0))]
+    common = 0
+    gathered = 0
+    share = 1.0
     for window in tiles(given):
         cells, known = compared(given, window)
         row, column = (place // given.finer for place in np.nonzero(known))

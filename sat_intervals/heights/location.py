@@ -17,7 +17,9 @@ except ModuleNotFoundError as error:
 # Largest error of the inverse of a grid in sensor pixels, and iterations: a grid is affine but for a thousandth.
 _NEAR, _MOST = 1e-6, 30
 # Pixels between nodes of the lattice on the ground, nodes along its axes, and nodes over the heights.
-_SPACING, _NODES, _LEVELS = 32, 256, 5
+_SPACING = 32
+_NODES = 256
+_LEVELS = 5
 
 
 class Location:

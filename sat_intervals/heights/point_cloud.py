@@ -22,7 +22,9 @@ from sat_intervals.tiling import Grid, Tile, Window
 _NEAR = 2  # pixels around a point whose median outliers are compared with
 # Points do not widen a surface that are fewer than this share of a window, or farther than so many metres, and than the
 # range of heights there, from all but the tails of the heights of their window.
-_FEW, _FAR, _TAIL = 1e-4, 20.0, 0.01
+_FEW = 1e-4
+_FAR = 20.0
+_TAIL = 0.01
 _DOUBTFUL = 0.1  # confidence below which points beside missing data of the right image are left out
 _HEIGHT = slice(2, 3)  # the height among the values of a lattice
 

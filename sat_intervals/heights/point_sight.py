@@ -20,7 +20,9 @@ class PointVisibility:
 
     def __init__(self, file: BinaryIO, region: Window, rise: float) -> None:
         """``rise``: signed change of disparity for a height of one pixel's size on the ground."""
-        self._region, self._rise, self._sign = region, rise, np.sign(rise)
+        self._region = region
+        self._rise = rise
+        self._sign = np.sign(rise)
         self._points = 0
         nothing = np.full(region.width, -np.inf, np.float32).tobytes()
         for _ in range(region.height):  # a full disk raises here; once mapped it would end the process

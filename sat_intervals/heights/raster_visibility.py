@@ -12,7 +12,9 @@ from sat_intervals.raster import HeightRaster, Projection
 from sat_intervals.tiling import Window
 
 # Side of a tile in pixels, fewer for fine references: at most this many cells of the reference below its pixels.
-_TILE, _LEAST, _CELLS = 256, 32, 1024
+_TILE = 256
+_LEAST = 32
+_CELLS = 1024
 _THREADS = 3  # tiles at once: their windows of a fine reference are most of the memory
 # Degrees: a pixel on a steeper patch between four heights has no disparity, as the place of a wall is known to a cell.
 _STEEPEST = 70.0
@@ -39,7 +41,10 @@ class RasterVisibility:
         shift: np.ndarray,
         search: tuple[int, int],
     ) -> None:
-        self._lattice_of, self._raster, self._projection, self._shift = lattice_of, raster, projection, shift
+        self._lattice_of = lattice_of
+        self._raster = raster
+        self._projection = projection
+        self._shift = shift
         self._search = search
         self._lattice = lattice
         self._heights: dict[int, tuple[float, float]] = {}

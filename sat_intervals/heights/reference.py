@@ -97,7 +97,10 @@ class _Work:
 
     def __init__(self, geometry: Geometry, reference: Reference) -> None:
         run, sensors = geometry.run, geometry.sensors
-        self.run, self._sensors, self._lattice, self._path = run, sensors, geometry.lattice, reference.path
+        self.run = run
+        self._sensors = sensors
+        self._lattice = geometry.lattice
+        self._path = reference.path
         search, region = run.config.disparity, run.region
         self._search = search.minimum, search.maximum
         self._location = Location(sensors)

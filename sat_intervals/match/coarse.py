@@ -28,7 +28,9 @@ _REACH = 0.3
 _SPECKLE = 60
 # Share of the usable pixels that a surface needs to be trusted wherever it lies, and how far from such surfaces, in
 # widths of their range and in pixels of the level, smaller ones may lie.
-_LARGE, _NEAR, _NEAR_PIXELS = 0.005, 0.5, 8
+_LARGE = 0.005
+_NEAR = 0.5
+_NEAR_PIXELS = 8
 # Share of matches beyond the range at each end, and the margin beyond it: pixels of the level, and widths of the range.
 _BEYOND, _MARGIN = 0.0005, (2, 0.05)
 _MARGIN_BETWEEN = 2, 0.1
@@ -42,7 +44,9 @@ _STRIP_BYTES, _SUPPORT = 1 << 26, 16
 _BINS = 32
 # Side of a cell of the local ranges in pixels of the level, share of its usable pixels that must be matched, and the
 # margin of its range: pixels of the level, and pixels.
-_CELL, _UNDERSTOOD, _LOCAL_MARGIN = 32, 0.2, (2, 1)
+_CELL = 32
+_UNDERSTOOD = 0.2
+_LOCAL_MARGIN = (2, 1)
 
 
 class NoRangeError(SatIntervalsError):

@@ -11,7 +11,9 @@ from sat_intervals.config import ConfigError
 from sat_intervals.match.volume import unmasked
 
 # Names of dimensions, lower case.
-_DISPARITY, _ROW, _COLUMN = {"disp", "disparity", "disparities", "d"}, {"row", "rows", "y"}, {"col", "column", "x"}
+_DISPARITY = {"disp", "disparity", "disparities", "d"}
+_ROW = {"row", "rows", "y"}
+_COLUMN = {"col", "column", "x"}
 _FEWEST = 3
 # Of disparities that count as evenly spaced, relative to their step.
 _TOLERANCE = 1e-5

@@ -49,7 +49,10 @@ def calibration_of_parts(
     parts: Sequence[Measured], config: Config, name: str, pairs: list[dict[str, Any]], key: dict[str, Any]
 ) -> tuple[Calibration, list[dict[str, float]]]:
     """Return the calibration of measured parts with ``pairs`` as provenance, and what to expect of it by coverage."""
-    thresholds, pool, expected, notes = threshold_sweep(config), pooled(parts), [], []
+    thresholds = threshold_sweep(config)
+    pool = pooled(parts)
+    expected = []
+    notes = []
     chosen: list[Levels] = []
     for coverage, groups in zip(COVERAGES, left_out(parts, thresholds, COVERAGES), strict=True):
         levels, doubts = choose(pool, thresholds, coverage)

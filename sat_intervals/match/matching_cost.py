@@ -142,7 +142,9 @@ def _varies(view: View, radius: int) -> np.ndarray:
 def textureless(cost: AreaCosts, area: Area, config: Config, cells: Cells | None = None) -> np.ndarray:
     """Pixels of the base whose window, and all usable windows that face it, do not vary along any row."""
     # All their candidates cost the same. SGM would still choose among them, by costs carried in from the image borders.
-    costs, views, radius = cost.costs, cost.views, config.cost.window // 2
+    costs = cost.costs
+    views = cost.views
+    radius = config.cost.window // 2
     if views is None:
         return np.zeros(costs.left_state.shape, np.bool_)
     base_varies, there_varies = of_area(area, views, [_varies(view, radius) for view in views], radius)

@@ -24,7 +24,9 @@ _LOWEST, _THRESHOLDS = 1 / 256, 25
 # Factors of the same number of thresholds, and the last one.
 _FACTORS, _ALL = (1 / 16, 64), 6e4
 # Widths are counted in steps of 1/64 px up to 8 px, and of 1 % above.
-_STEPS, _FINE, _RATIO = 64, 8, 1.01
+_STEPS = 64
+_FINE = 8
+_RATIO = 1.01
 _COARSE = ceil(np.log(32000 / _FINE) / np.log(_RATIO)) + 1
 WIDTHS = np.concatenate([np.arange(_FINE * _STEPS) / _STEPS, _FINE * _RATIO ** (np.arange(_COARSE) + 0.5)])
 # Place of a width among them, by its number of steps.
@@ -32,7 +34,10 @@ _UPTO = np.arange(32000 * _STEPS + 1)
 _ABOVE = _FINE * _STEPS + np.log(np.maximum(_UPTO, _FINE * _STEPS) / (_FINE * _STEPS)) / np.log(_RATIO)
 _PLACES = np.where(_UPTO < _FINE * _STEPS, _UPTO, _ABOVE).astype(np.int16)
 # Fields of a measurement: pixels that hold the truth, sum of widths, sum of distances that miss, counts by width.
-INSIDE, WIDTH, MISSED, COUNTS = 0, 1, 2, 3
+INSIDE = 0
+WIDTH = 1
+MISSED = 2
+COUNTS = 3
 FIELDS = COUNTS + WIDTHS.size
 
 

@@ -19,10 +19,14 @@ STRIP_PIXELS = 1 << 19
 _PIECE_BYTES, _PIECE_ROWS = 100, 64
 # With least squares: more temporary arrays, per pixel of a strip the pixels of both images, and, before there are
 # bands, what reading them needs, at the rows of a function.
-_FIT_BYTES, _IMAGES_BYTES, _READING_BYTES = 60, 8, 60
+_FIT_BYTES = 60
+_IMAGES_BYTES = 8
+_READING_BYTES = 60
 # Per pixel of a strip: final bands, which are compressed one file after another; and per pixel of the columns that are
 # compressed at a time: what is written, read back and compared.
-_BAND_BYTES, _BLOCK_BYTES, _COLUMNS = 18, 64, 2048
+_BAND_BYTES = 18
+_BLOCK_BYTES = 64
+_COLUMNS = 2048
 
 # Side in pixels of a block of small tiles, at most: that of one tile of the default size.
 _BLOCK = 1024

@@ -28,7 +28,9 @@ _HALF = 128
 _MATCHED = 0.62
 # Pixels of residual in a quarter of the sample blocks from which on they have jitter, and are no epipolar pair; and in
 # half of them above which no polynomial holds, so that a constant is taken.
-_JITTER, _CONTRADICTING, _HOLDING = 0.3, 4.0, 0.5
+_JITTER = 0.3
+_CONTRADICTING = 4.0
+_HOLDING = 0.5
 
 
 @dataclass(frozen=True)

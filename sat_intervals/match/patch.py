@@ -110,7 +110,9 @@ def mirrored_frame(frame: PatchFrame, config: Config) -> PatchFrame:
 
 def path_window(frame: PatchFrame, config: Config) -> Window:
     """Pixels whose paths a tile computes: its core and, at the ends of the region, the pixels that support it."""
-    core, region, around = frame.core, frame.region, _supported(frame, config)
+    core = frame.core
+    region = frame.region
+    around = _supported(frame, config)
     row = around.row if core.row == region.row else core.row
     column = around.column if core.column == region.column else core.column
     row_stop = around.row_stop if core.row_stop == region.row_stop else core.row_stop

@@ -11,7 +11,9 @@ from sat_intervals.tiling import Views, Window
 # Rows above and below that a refined disparity depends on: windows of fits, and of planes.
 HALO = FIT + PLANE
 # Deviation in pixels that stands for a pixel without a fit, and what adds to a deviation and to a side of the cut.
-_NO_FIT, _LEAST, _SIDE = np.float32(1.0), np.float32(0.2), np.float32(0.3)
+_NO_FIT = np.float32(1.0)
+_LEAST = np.float32(0.2)
+_SIDE = np.float32(0.3)
 
 
 class Refined(NamedTuple):

@@ -12,9 +12,13 @@ from sat_intervals.match.whole import cut, match_whole
 from sat_intervals.tiling import View, Window, facing
 
 # Side of a block, and blocks along each side of the image at most; side of its part that is matched at full resolution.
-_SIDE, _BLOCKS, _PART = 256, 5, 96
+_SIDE = 256
+_BLOCKS = 5
+_PART = 96
 # What a block is reduced by first, the pixels of a surface there, and the rows of that level that are tried first.
-_STEP, _SPECKLE, _MOST = Step(4, 4), 40, 4
+_STEP = Step(4, 4)
+_SPECKLE = 40
+_MOST = 4
 # Rows up and down that are tried at a level, and the box over which costs are summed.
 _ROWS, _BOX = 2, 9
 # Side of the cells in which rows are tried first.
@@ -27,9 +31,14 @@ _AWAY_FROM_MIDDLE = 0.0005
 # Distance of the random candidates that a match is compared with, in columns.
 _AWAY = 16
 # Least-squares windows: pixels between centres, from the centre to the sides, and the share that must be matched.
-_BETWEEN, _RADIUS, _MATCHED = 4, 4, 0.5
+_BETWEEN = 4
+_RADIUS = 4
+_MATCHED = 0.5
 # Gain of a likely window, the largest shift that is believed, shifts that are enough, and steps.
-_LIKELY, _FARTHEST, _ENOUGH, _STEPS = 0.2, 1.5, 30, 3
+_LIKELY = 0.2
+_FARTHEST = 1.5
+_ENOUGH = 30
+_STEPS = 3
 
 
 class SampleBlock(NamedTuple):

@@ -13,7 +13,9 @@ from sat_intervals.products import LOG_SPAN
 from sat_intervals.tiling import Views, strips
 
 # Relative to the span: values beyond it by rounding. Of the sum of probabilities. Pixels of rows converted at a time.
-_TOLERANCE, _SUM, _PIXELS = 1e-5, 1e-3, 1 << 14
+_TOLERANCE = 1e-5
+_SUM = 1e-3
+_PIXELS = 1 << 14
 
 
 def _section(config: Config) -> Volume:

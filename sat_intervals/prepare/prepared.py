@@ -93,7 +93,9 @@ def _searched(
     pair: Pair, config: Config, each: Each, known: Mapping[str, Any]
 ) -> tuple[Config, Found | None, LocalRanges | None]:
     """Return settings with the search range as numbers, what was found if needed, and local ranges, if any."""
-    search, found, local = config.disparity, None, None
+    search = config.disparity
+    found = None
+    local = None
     if given := pair.given_ranges(search):
         local, source = given
         config = with_hull(config, local, source) if search.is_auto else config

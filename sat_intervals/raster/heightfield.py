@@ -25,7 +25,9 @@ _METRE = re.compile(r"[\[(]?(m|met(re|er)s?|unknown)\b[^/*^\d]*|", re.IGNORECASE
 # Side of a block in cells, and blocks in memory, a megabyte each: neighbouring windows share most of theirs.
 _BLOCK, _KEPT = 512, 128
 # Rows and columns that are looked at for no data, the share of a value that may be it, and metres from all others.
-_LOOKED, _COMMON, _AWAY = 2000, 0.002, 50.0
+_LOOKED = 2000
+_COMMON = 0.002
+_AWAY = 50.0
 
 _LOG = logging.getLogger(__name__)
 

@@ -28,7 +28,9 @@ class Stream:
 
     def __init__(self, file: File, folder: Path, shape: tuple[int, int], threads: int | None) -> None:
         """``folder``: where temporary files without names are made."""
-        self._file, self._folder, self._threads = file, folder, threads
+        self._file = file
+        self._folder = folder
+        self._threads = threads
         self._shapes = [(-(-shape[0] // factor), -(-shape[1] // factor)) for factor in factors(*shape)]
         self._rows = [0 for _ in self._shapes]
         with ExitStack() as files:

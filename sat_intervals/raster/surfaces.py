@@ -127,7 +127,9 @@ def ground_of(path: Path, bounds: Bounds, around: float) -> tuple[np.ndarray, Ge
     """
     shape, place = read_place(path)
     west, south, east, north = bounds
-    window, whole, degrees = _cells(place, bounds), Window(0, 0, *shape), CRS.from_epsg(4326)
+    window = _cells(place, bounds)
+    whole = Window(0, 0, *shape)
+    degrees = CRS.from_epsg(4326)
     if window.clipped(whole) != window:
         ends = array_bounds(*shape, place.transform)
         own = transform_bounds(place.crs, degrees, ends[0], min(ends[1::2]), ends[2], max(ends[1::2]))

@@ -19,7 +19,9 @@ from sat_intervals.tiling import View, Views, Window
 _FLOAT32_HOLDS = {"uint8", "int8", "uint16", "int16", "float16", "float32"}
 _EXACT = 2**53  # integers up to this are exact in float64
 # Shares by which floats may differ from a no-data value as people write it, the second one above the third number.
-_DIGITS, _FEW_DIGITS, _LARGE = {"float32": 1e-6}, 1e-3, 1e38
+_DIGITS = {"float32": 1e-6}
+_FEW_DIGITS = 1e-3
+_LARGE = 1e38
 
 
 def read_views(images: Iterable[Image], windows: Iterable[Window]) -> Views:

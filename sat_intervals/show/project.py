@@ -79,7 +79,9 @@ def write_project(out: str | Path) -> list[Path]:
 
 
 def _results(run: Run) -> Iterator[ProjectLayer]:
-    group, shape, place = "Heights" if run.is_sweep else "Disparity", run.shape, run.georeferencing
+    group = "Heights" if run.is_sweep else "Disparity"
+    shape = run.shape
+    place = run.georeferencing
     validity = Raster(run.out / "validity.tif", place, shape)
     counts = np.zeros(1 << 16, np.int64)
     for window in run.windows():

@@ -12,9 +12,13 @@ from sat_intervals.raster import Georeferencing, Projection, fitted_rpc, north_u
 from sat_intervals.raster.publishing import check_free
 
 # Where the scene stands: a map, and the corner of its first pixel.
-CRS, LEFT, TOP = "EPSG:32631", 370_000.0, 4_830_000.0
+CRS = "EPSG:32631"
+LEFT = 370_000.0
+TOP = 4_830_000.0
 # Half of the largest base-to-height ratio of three images, and of more; pixels of the errors of models (sigma).
-_FEW, _MANY, ERROR = 0.15, 0.35, 0.7
+_FEW = 0.15
+_MANY = 0.35
+ERROR = 0.7
 # Metres above and below the datum that models are made for.
 _REACH = 80.0
 _TAGS = {"SOFTWARE": "sat-intervals"}

@@ -107,7 +107,9 @@ def _rows(run: Mapping[str, Any]) -> dict[str, str]:
 def _summary(contents: Mapping[str, Any]) -> str:
     """Return the main figures of a run as rows of an HTML table, for browsers without scripts."""
     run, counts = contents["run"], contents["run"]["counts"]
-    region, search, width = run["tiles"]["region"], contents["quantity"], counts["median_interval_width"]
+    region = run["tiles"]["region"]
+    search = contents["quantity"]
+    width = counts["median_interval_width"]
     swept, unit = "sweep" in run, search["unit"]
     form = ".2f" if swept else ".6g"
     images = ", ".join(one["path"] for one in run["sweep"]["images"]) if swept else run["inputs"]["left"]["path"]
