@@ -156,8 +156,8 @@ class Ambiguity(Section):
 class Refinement(Section):
     """Sub-pixel refinement of the disparity."""
 
-    method: Literal["least_squares", "vfit"] = Field(
-        "least_squares", description="grey values around the winner, or a V through three costs"
+    method: Literal["least_squares", "vfit", "planes"] = Field(
+        "least_squares", description="grey values around the winner, a V through three costs, or planes through those"
     )
 
 

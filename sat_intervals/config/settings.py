@@ -84,7 +84,7 @@ class Config(sections.Section):
         if not self.cost.compares_two and (self.cross_check or self.fits or self.disparity.around):
             raise ValueError(
                 f"cost.method {self.cost.method} has no right image: set cross_check to null, refinement.method to "
-                "vfit, and leave out around"
+                "vfit or planes, and leave out around"
             )
         # Neighbouring tiles are compared on a ring of one pixel around the core, which needs complete windows.
         smallest = self.cost.window // 2 + 1
@@ -190,6 +190,11 @@ class Config(sections.Section):
     def fits(self) -> bool:
         """Return whether disparities are refined by least squares."""
         return self.refinement is not None and self.refinement.method == "least_squares"
+
+    @property
+    def has_planes(self) -> bool:
+        """Return whether disparities become those of planes through their surroundings."""
+        return self.refinement is not None and self.refinement.method != "vfit"
 
     @property
     def has_coverage(self) -> bool:

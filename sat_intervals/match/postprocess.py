@@ -16,7 +16,7 @@ from sat_intervals.kernels.disparity import cross_check, median
 from sat_intervals.kernels.intervals import regularize
 from sat_intervals.kernels.matching import Raw, RightView
 from sat_intervals.match.histogram import quantile
-from sat_intervals.match.refinement import HALO, Refined, bounds_of_both, refined
+from sat_intervals.match.refinement import Refined, bounds_of_both, halo_of, refined, smoothed
 
 # Many images: side of the windows, and steps of height between their cells, that errors are larger in, whatever the
 # confidence: half widths of .9 fall from .99 to .49 m on ten images of a city if these cells count as uncertain.
@@ -104,7 +104,7 @@ def halo(config: Config) -> int:
     """Number of rows above and below that the final bands of a row depend on."""
     radius = config.median.size // 2 if config.median else 0
     radius += 0 if config.cost.compares_two else _ROUGH[0] // 2
-    return radius + max(config.regularization.depth if config.regularization else 0, HALO if config.fits else 0)
+    return radius + max(config.regularization.depth if config.regularization else 0, halo_of(config))
 
 
 def postprocess_rows(rows: RawRows, first: int, last: int, scale: ConfidenceScale, config: Config) -> products.Bands:
@@ -156,6 +156,8 @@ def filter_rows(rows: RawRows, scale: ConfidenceScale, config: Config) -> Filter
     if config.fits:
         disparity, deviation = refined(disparity, kept, rows.left, rows.right, config)
         validity[np.isfinite(deviation)] &= ~np.uint16(products.NOT_REFINED)
+    elif config.has_planes:
+        disparity = smoothed(disparity, kept, config)
     written = searched if config.products.keep_rejected else kept
     return Filtered(disparity, lower, upper, confidence, validity, low, written, deviation)
 

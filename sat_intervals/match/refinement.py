@@ -8,8 +8,6 @@ from sat_intervals.config import Config
 from sat_intervals.kernels.refinement import FIT, MARGIN, PLANE, facing_values, least_squares, on_planes
 from sat_intervals.tiling import Views, Window
 
-# Rows above and below that a refined disparity depends on: windows of fits, and of planes.
-HALO = FIT + PLANE
 # Deviation in pixels that stands for a pixel without a fit, and what adds to a deviation and to a side of the cut.
 _NO_FIT = np.float32(1.0)
 _LEAST = np.float32(0.2)
@@ -48,6 +46,18 @@ def refined(disparity: np.ndarray, kept: np.ndarray, left: np.ndarray, right: np
     smooth = on_planes(np.where(np.isnan(deviation), matched, matched + shift), deviation)
     deviation[(smooth < search.minimum) | (smooth > search.maximum)] = np.nan
     return Refined(np.where(np.isnan(deviation), disparity, smooth), deviation)
+
+
+def halo_of(config: Config) -> int:
+    """Return the rows above and below that a refined disparity depends on: windows of fits, and of planes."""
+    return FIT * config.fits + PLANE * config.has_planes
+
+
+def smoothed(disparity: np.ndarray, kept: np.ndarray, config: Config) -> np.ndarray:
+    """Return disparities that are kept on planes through those around, inside the search range; others stay."""
+    nothing = np.float32(np.nan)
+    smooth = on_planes(np.where(kept, disparity, nothing), np.where(kept, np.float32(0), nothing))
+    return np.where(kept, np.clip(smooth, config.disparity.minimum, config.disparity.maximum), disparity)
 
 
 def bounds_of_both(

@@ -6,7 +6,7 @@ import reference
 from numpy.testing import assert_allclose, assert_array_equal
 
 from sat_intervals import load_config, match_arrays
-from sat_intervals.match.refinement import Refined, bounds_of_both, pixel_windows, pixels_of, refined
+from sat_intervals.match.refinement import Refined, bounds_of_both, pixel_windows, pixels_of, refined, smoothed
 from sat_intervals.match.whole import cut, whole_view
 from sat_intervals.products import INVALID, NOT_REFINED, REGULARIZED
 from sat_intervals.tiling import Window
@@ -27,8 +27,8 @@ def matched():
     images = pair()
     return {
         method: match_arrays(*images, {"preset": "satellite", "disparity": SEARCH, "refinement": {"method": method}} | (
-            {"interval": {"alpha": 0.9}} if method == "vfit" else {}))
-        for method in ("vfit", "least_squares")
+            {} if method == "least_squares" else {"interval": {"alpha": 0.9}}))
+        for method in ("vfit", "planes", "least_squares")
     }  # fmt: skip
 
 
@@ -36,6 +36,7 @@ def test_refined__is_nearer_to_the_truth(matched):
     inner = np.s_[10:-10, 20:-20]
     errors = {name: np.abs(found.disparity.values[inner] - 3.3) for name, found in matched.items()}
     assert np.nanmedian(errors["least_squares"]) < 0.5 * np.nanmedian(errors["vfit"])
+    assert np.nanstd(errors["planes"]) < 0.5 * np.nanstd(errors["vfit"])
     assert np.nanmedian(errors["least_squares"]) < 0.05
 
 
@@ -113,3 +114,15 @@ def test_refined__only_where_it_is_kept():
     assert_allclose(np.median(found.disparity[4:36, 8:24]), 2.4, atol=0.05)
     assert_array_equal(found.disparity[:, 30:], 2)
     assert np.isnan(found.deviation[:, 30:]).all()
+
+
+def test_smoothed__averages_noise_of_slopes_and_keeps_walls_and_what_is_rejected():
+    config = load_config({"disparity": SEARCH, "refinement": {"method": "planes"}})
+    row, column = np.mgrid[0.0:40, 0.0:60]
+    truth = np.where(column < 30, 0.05 * row, 6 + 0.05 * column).astype(np.float32)
+    noisy = (truth + np.random.default_rng(0).normal(0, 0.1, truth.shape)).astype(np.float32)
+    kept = column != 10
+    found = smoothed(noisy, kept, config)
+    assert_array_equal(found[~kept], noisy[~kept])
+    assert np.abs(found - truth)[kept].std() < 0.4 * np.abs(noisy - truth)[kept].std()
+    assert np.abs(found - truth)[kept].max() < 0.2
