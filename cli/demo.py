@@ -90,20 +90,19 @@ def _demo_of_many(
     out: Path, count: int, size: tuple[int, int], settings: SettingsArguments, run: RunArguments, **scene: Any
 ) -> None:
     """Make raw images and the surface of all of them, and compare it with the true heights."""
-    from sat_intervals.config import load_config
     from sat_intervals.demo import PIXEL
     from sat_intervals.evaluate.surface_accuracy import evaluate_surface
     from sat_intervals.workflows.demo import write_views
-    from sat_intervals.workflows.many import surface_of_many
+    from sat_intervals.workflows.surface import surface
 
     settings.check_kept(out, out / "truth.tif", out / "dsm.tif")
-    config = load_config(settings.file or {"preset": "many"}, settings.sections)
+    config = settings.load(count)
     how = {"keep_tiles": run.keep_tiles, "overwrite": run.overwrite}
     with run.console() as console:
         console.progress("scene", 0, 1)
         paths, truth = write_views(out, *size, count, overwrite=run.overwrite, **scene)
         console.progress("scene", 1, 1)
-        report = surface_of_many(paths, out, config, resolution=PIXEL, progress=console.progress, **how)
+        report = surface(paths, out, config, resolution=PIXEL, progress=console.progress, **how)
     figures = evaluate_surface(out / "dsm.tif", truth)["all"]
     run.say({"run": report, "truth": figures})
     if not run.as_json:

@@ -4,11 +4,10 @@ from pathlib import Path
 
 import click
 
+from sat_intervals.cli.images import PairArguments, pair_options
 from sat_intervals.cli.matching import (
-    PairArguments,
     RunArguments,
     SettingsArguments,
-    pair_options,
     run_options,
     search_options,
 )

@@ -1,4 +1,4 @@
-"""Options shared by the commands that match: the pair, its settings, the run."""
+"""Options shared by the commands that match: settings, the run."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +13,6 @@ from sat_intervals.cli.options import (
     NAME,
     PRESETS,
     Command,
-    Decorator,
     Printing,
     expert_option,
     gathered,
@@ -26,37 +25,6 @@ from sat_intervals.cli.options import (
 if TYPE_CHECKING:
     from sat_intervals.config import Config
     from sat_intervals.raster import Image
-    from sat_intervals.tiling import Window
-
-
-@dataclass(frozen=True)
-class PairArguments:
-    """Two epipolar images with their masks, no-data values and bands, and the region of the left one to match."""
-
-    left: str
-    right: str
-    left_mask: str | None
-    right_mask: str | None
-    nodata: tuple[float, float] | None
-    band: tuple[int, int] | None
-    region: tuple[int, int, int, int] | None = None
-    more: tuple[str, ...] = ()
-
-    @property
-    def window(self) -> "Window | None":
-        """Return the region to match, None for all."""
-        from sat_intervals.tiling import Window
-
-        return Window(*self.region) if self.region else None
-
-    def open(self) -> "tuple[Image, Image]":
-        """Open both images."""
-        from sat_intervals.raster import open_image
-
-        nodata, band = self.nodata or (None, None), self.band or (None, None)
-        left = open_image(self.left, band=band[0], nodata=nodata[0], mask=self.left_mask)
-        right = open_image(self.right, band=band[1], nodata=nodata[1], mask=self.right_mask)
-        return left, right
 
 
 @dataclass(frozen=True)
@@ -67,11 +35,11 @@ class SettingsArguments:
     sections: dict[str, Any]
     options: tuple[str, ...] = ()
 
-    def load(self, **sections: Any) -> "Config":
-        """Load the settings; the sections given here win."""
+    def load(self, images: int = 2, **sections: Any) -> "Config":
+        """Load the settings for a number of images; the sections given here win."""
         from sat_intervals.config import load_config
 
-        return load_config(load_config(self.file, self.sections), sections)
+        return load_config(load_config(self.file, self.sections, images=images), sections)
 
     def check_kept(self, out: Path, *others: Path) -> None:
         """Raise if a run in the folder ``out``, or another file that is written, would replace the file of settings."""
@@ -104,44 +72,6 @@ class RunArguments(Printing):  # type: ignore[misc,unused-ignore]
 
             count = "1 warning" if len(warnings) == 1 else f"{len(warnings)} warnings"
             raise RunError(f"{count}, see above, and --strict is given; the files are written")
-
-
-class _Both(click.ParamType):  # type: ignore[type-arg,unused-ignore]
-    """A number for both images, or two, LEFT,RIGHT."""
-
-    def __init__(self, kind: type[float]) -> None:
-        self.name, self._kind = kind.__name__, kind
-
-    def convert(self, value: Any, parameter: click.Parameter | None, context: click.Context | None) -> Any:
-        try:
-            left, *right = map(self._kind, str(value).split(","))
-            (right_or_left,) = right or (left,)
-        except ValueError:
-            self.fail(f"{value!r} is neither a number nor two, LEFT,RIGHT", parameter, context)
-        return left, right_or_left
-
-
-IMAGE_OPTIONS = (
-    click.option("--left-mask", type=NAME, help="Mask of the left image: non-zero = masked."),
-    click.option("--right-mask", type=NAME, help="Mask of the right image."),
-    click.option(
-        "--nodata",
-        type=_Both(float),
-        metavar="V",
-        help="No-data value of both images, or LEFT,RIGHT; replaces that of the files.",
-    ),
-    expert_option("--band", type=_Both(int), metavar="N", help="Band to match in the images, or LEFT,RIGHT."),
-)
-# The command gets ``pair``.
-_PAIR = click.argument("left", type=NAME), click.argument("right", type=NAME)
-image_options = gathered("pair", PairArguments, *_PAIR, *IMAGE_OPTIONS)
-
-
-def pair_options(command: Command, images: Decorator = image_options) -> Command:
-    """Add options for an epipolar pair and the region to match; the command gets ``pair``, a `PairArguments`."""
-    names = "--window", "region"
-    text = "Region of the left image to match."
-    return images(click.option(*names, type=int, nargs=4, metavar="ROW COL HEIGHT WIDTH", help=text)(command))
 
 
 _LEVEL_OPTIONS = (

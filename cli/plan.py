@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from sat_intervals.cli.matching import PairArguments, SettingsArguments, pair_options, search_options
+from sat_intervals.cli.images import PairArguments, pair_options
+from sat_intervals.cli.matching import SettingsArguments, search_options
 from sat_intervals.cli.options import Grouped, json_option, log_options, say_json
 
 if TYPE_CHECKING:

@@ -6,8 +6,8 @@ from typing import Any
 
 import click
 
+from sat_intervals.cli.images import PairArguments, pair_options
 from sat_intervals.cli.logs import warn
-from sat_intervals.cli.matching import PairArguments, pair_options
 from sat_intervals.cli.options import FILE, Grouped, Printing, overwrite_option, printing_options
 
 # Bars of the histogram that are printed, each of several bins.

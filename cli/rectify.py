@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from sat_intervals.cli import options
+from sat_intervals.cli.images import PairArguments, image_options
 from sat_intervals.cli.logs import warn
-from sat_intervals.cli.matching import PairArguments, image_options
 
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console

@@ -26,7 +26,6 @@ if typing.TYPE_CHECKING:
     from sat_intervals.run.pair import match_pair
     from sat_intervals.tiling import Window
     from sat_intervals.workflows.calibrate import calibrate
-    from sat_intervals.workflows.many import surface_of_many
     from sat_intervals.workflows.rectify import rectify
     from sat_intervals.workflows.surface import surface
 
@@ -36,7 +35,7 @@ __all__ = [
     "Config", "RunError", "SatIntervalsError", "SurfaceChoices", "Window", "__version__", "calibrate",
     "calibrate_surface", "calibrate_volumes", "decode_flags", "evaluate_run", "evaluate_surface", "intervals_around",
     "intervals_of", "load_config", "load_height_calibration", "make_surface", "match_arrays", "match_pair", "open",
-    "open_image", "open_surface", "rectify", "set_geometry", "surface", "surface_of_many", "triangulate",
+    "open_image", "open_surface", "rectify", "set_geometry", "surface", "triangulate",
 ]  # fmt: skip
 
 logging.getLogger(__name__).addHandler(logging.NullHandler())  # the application configures logging
@@ -66,7 +65,6 @@ _HOMES = {
     "rectify": "workflows.rectify",
     "set_geometry": "heights.geometry",
     "surface": "workflows.surface",
-    "surface_of_many": "workflows.many",
     "triangulate": "heights.triangulate",
 }
 

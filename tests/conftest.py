@@ -20,7 +20,7 @@ from sat_intervals.demo import Scene, make_scene
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.raster import write_layer
 from sat_intervals.workflows.demo import write_views
-from sat_intervals.workflows.many import surface_of_many
+from sat_intervals.workflows.surface import surface
 
 pytest_plugins = ["services.browser", "services.s3", "services.slurm", "services.web"]
 
@@ -116,7 +116,7 @@ def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a finished sweep of three images, which are beside it: 1.tif, 2.tif, 3.tif."""
     folder = tmp_path_factory.mktemp("swept")
     images, _ = write_views(folder, 200, 200, 3)
-    surface_of_many(images, folder / "out", resolution=0.5)
+    surface(images, folder / "out", resolution=0.5)
     return folder / "out"
 
 

@@ -9,7 +9,7 @@ from sat_intervals.demo import PIXEL
 from sat_intervals.raster import Georeferencing, read_layers, write_layer
 from sat_intervals.raster.images import opened
 from sat_intervals.workflows.demo import CRS, LEFT, TOP, errors_of, slants_of, write_views
-from sat_intervals.workflows.many import surface_of_many
+from sat_intervals.workflows.surface import surface
 
 ROWS, COLUMNS, SEED = 200, 220, 1
 OPTIONS = {"resolution": PIXEL, "crs": CRS}
@@ -28,7 +28,7 @@ class Sweep(NamedTuple):
 def swept(folder, **options):
     """Write five views of a scene, and make their surface."""
     images, truth = write_views(folder, ROWS, COLUMNS, 5, SEED)
-    report = surface_of_many(images, folder / "out", **OPTIONS | options)
+    report = surface(images, folder / "out", **OPTIONS | options)
     return Sweep(images, folder / "out", report, on_cells(read_layers(truth)[0], report["sweep"]["cells"]))
 
 

@@ -53,9 +53,8 @@ OVER_THE_LIMITS = {
     "sat_intervals.kernels.plane_sweep.sweep": "the arrays of a kernel",
     "sat_intervals.run.pair.match_pair": "what a run takes, with a matcher of one's own",
     "sat_intervals.workflows.calibrate.calibrate": "how pairs are matched and compared with their truth, by name",
-    "sat_intervals.workflows.many.surface_of_many": "what a sweep takes, by name",
     "sat_intervals.workflows.rectify.rectify": "what raw images need, by name",
-    "sat_intervals.workflows.surface.surface": "what its three steps take, by name",
+    "sat_intervals.workflows.surface.surface": "what the steps of both ways take, by name",
 }
 
 # Test files without a module of their name: they test several modules together.

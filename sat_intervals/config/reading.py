@@ -24,6 +24,7 @@ def load_config(
     *,
     preset_wins: bool = False,
     file: Path | None = None,
+    images: int = 2,
 ) -> Config:
     """Check settings and complete them with the defaults.
 
@@ -38,6 +39,8 @@ def load_config(
         Whether the overrides' ``preset`` wins too; otherwise two different presets are refused.
     file
         Named by errors, of a mapping that was read from it.
+    images
+        Their number: of three and more the preset is ``many``, if none is given.
 
     Raises
     ------
@@ -57,7 +60,7 @@ def load_config(
         )
     if len(set(map(str, names))) > 1 and not preset_wins:
         raise ConfigError(f"{place}preset is {shown(names[0])}, and {shown(names[1])} is asked for: leave one out")
-    preset = names[-1] if names else PRESETS[0]
+    preset = names[-1] if names else "many" if images > 2 else PRESETS[0]
     # Before the overrides: those of another cost drop what the source has for the cost of its preset.
     values = merged(preset_settings(preset) if preset in PRESETS else {}, values)
     try:

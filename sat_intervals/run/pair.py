@@ -123,8 +123,9 @@ def _named(config: Config, volume_of: VolumeOf | None) -> Config:
 
 
 def compile_for(job: Job) -> None:
-    """Compile or load the kernels of a run, before its tiles."""
-    compile_kernels(job.config, hands_states_on=job.hands_states_on)
+    """Compile or load the kernels of a run, before its tiles; those of a sweep were needed before."""
+    if job.swept is None:
+        compile_kernels(job.config, hands_states_on=job.hands_states_on)
 
 
 def complete_before(job: Job) -> dict[str, Any]:

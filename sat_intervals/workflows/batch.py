@@ -153,7 +153,7 @@ class _Surfaces:
         if not pair.resolution:
             return images
         out, sensors = self._out / pair.name, pair.sensors or ()
-        made = epipolar_pair(*images, out, sensors, _window(pair), self._on_rectified, **self._how)
+        made = epipolar_pair(images, out, sensors, _window(pair), self._on_rectified, **self._how)
         if not has_grids(sensors):
             check_sensors(made.sensors, pair.resolution, None)
         self._sensors[pair.name] = made.sensors

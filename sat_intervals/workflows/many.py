@@ -2,12 +2,12 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from sat_intervals.config import Config, Sweep, load_config, resolved
+from sat_intervals.config import Config, Sweep, resolved
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.match.ground import GroundViews
@@ -16,7 +16,7 @@ from sat_intervals.prepare.pair import Each, FilePair
 from sat_intervals.prepare.prepared import Prepared
 from sat_intervals.products import plain
 from sat_intervals.progress import Progress, logged_stage
-from sat_intervals.raster import Image, Projection, north_up, open_image, utm_of
+from sat_intervals.raster import Image, Projection, north_up, utm_of
 from sat_intervals.raster.identity import check_not_replaced, identities, identity
 from sat_intervals.raster.publishing import check_free
 from sat_intervals.results import open_run
@@ -40,141 +40,115 @@ if TYPE_CHECKING:
     from sat_intervals.heights.point_cloud import Cells
 
 
-class _Given(NamedTuple):
-    """Cells and heights as they are given: metres, grid of a raster, CRS, geoid."""
+class Wanted(NamedTuple):
+    """The surface that is wanted of many images, see `surface`."""
 
-    resolution: float
+    resolution: float | Path
+    crs: str | None = None
+    geoid: Path | None = None
+    heights: tuple[float, float] | None = None
+    models: Sequence[str | Path | None] = ()
+    ortho: bool = False
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A sweep that is asked for and checked, before anything is found; ``digest``: of all that its geometry needs."""
+
+    images: dict[str, Image]
+    config: Config
+    wanted: Wanted
+    cell: float
     grid: "Cells | None"
-    crs: str | None
-    geoid: Path | None
-    heights: tuple[float, float] | None
+    inputs: dict[str, Any]
+    digest: str
+
+    @property
+    def request(self) -> str:
+        """Return a digest of all that is asked for."""
+        return digest([self.digest, self.config.model_dump(mode="json", exclude={"cluster", "preset"})])
+
+
+Geometry = tuple[GroundViews, dict[str, Any]]
+"""Where many images show the ground, and what ``run.json`` has of it."""
 
 
 def surface_of_many(
-    images: Sequence[str | Path | Image],
-    out: str | Path,
-    config: Any = None,
+    images: Sequence[Image],
+    out: Path,
+    config: Config,
+    wanted: Wanted,
     *,
-    resolution: float | Path,
-    crs: str | None = None,
-    geoid: str | Path | None = None,
-    heights: tuple[float, float] | None = None,
-    models: Sequence[str | Path | None] = (),
-    makes_ortho: bool = False,
     keep_tiles: bool = False,
     overwrite: bool = False,
     progress: Progress = lambda stage, done, total: None,
 ) -> dict[str, Any]:
-    """Make a surface model with height intervals of three or more raw images at once.
-
-    Images are resampled to the ground at each height and compared there; semi-global matching chooses the heights
-    (METHOD.md, section 20). The models are shifted to fit each other. To resume, call it again.
-
-    Parameters
-    ----------
-    images
-        Raw images with RPC models, paths or opened by `open_image`.
-    out
-        Folder for ``dsm.tif`` (the bands of `make_surface`; ``count`` is that of the images), ``validity.tif`` and
-        ``run.json``.
-    config
-        Settings, by default those of the preset ``many``; others need its ``cost``.
-    resolution, crs, geoid
-        As for `make_surface`.
-    heights
-        Lowest and highest height of the ground, metres above ``geoid`` or the ellipsoid; by default found.
-    models
-        RPC models of the images, None for those in or beside an image.
-    makes_ortho
-        Whether to write ``ortho.tif``, too: the median of the images, resampled to the surface.
-    keep_tiles, overwrite, progress
-        As for `match_pair`.
-
-    Returns
-    -------
-    The content of ``run.json``; ``sweep`` has the shifts (pixels) and likeness of the images, those left out, the grid,
-    heights and their step.
-
-    Raises
-    ------
-    SatIntervalsError
-        Images, models, settings or output cannot be used, or fewer than three images are like each other.
-    RunError
-        Tiles failed; no output was published.
-    """
-    from sat_intervals.heights.dsm import checked_cells
-
-    out, geoid = Path(out), None if geoid is None else Path(geoid)
-    config = resolved(load_config(config, {"preset": "many"} if config is None else None))
-    if not isinstance(config.cost, Sweep):
-        raise SatIntervalsError(f"cost.method is {config.cost.method}, which compares two images: give --preset many")
-    opened = _opened(images)
-    if heights and not heights[0] < heights[1]:
-        raise SatIntervalsError(
-            f"heights are {heights[0]:g} to {heights[1]:g} m: give the lowest one, then the highest"
-        )
-    grid, cell, crs, _ = checked_cells(resolution, crs, None, geoid)
-    given = _Given(cell, grid, crs, geoid, heights)
-    check_folder(out, overwrite=overwrite, names=outputs_of(config))
-    named = {f"image_{number}": image for number, image in enumerate(opened, start=1)}
-    inputs = describe_inputs(named, config, {})
-    outputs = [*outputs_of(config), *([ORTHO] if makes_ortho else [])]
-    check_not_replaced(identities(inputs), [out / name for name in outputs], [home_of(out)])
-    asked = digest(
-        plain(
-            {
-                "made_by": [version("sat-intervals"), FINGERPRINT],
-                "inputs": inputs,
-                "settings": config.model_dump(mode="json", exclude={"cluster", "tiles", "products", "preset"}),
-                "given": [cell, grid and asdict(grid), crs, heights],
-                "files": [file and identity(str(file), {}) for file in (geoid, *models)],
-            }
-        )
-    )
-    request = digest([asked, config.model_dump(mode="json", exclude={"cluster", "preset"})])
-    if makes_ortho and read_report(out) is None:
-        check_free(out / ORTHO, overwrite=overwrite)
-    is_made = not makes_ortho or (out / ORTHO).exists()
-    if is_made and not overwrite and (before := _complete_before(out, request, keep_tiles=keep_tiles)):
+    """Make the surface of three images or more, see `surface`; return the content of ``run.json``."""
+    asked = asked_of(images, out, config, wanted, overwrite=overwrite)
+    if not overwrite and (before := complete_sweep(asked, out, keep_tiles=keep_tiles)):
         return before
     seconds = dict[str, float]()
-    with Connection(config.cluster, out) as connection:
+    with Connection(asked.config.cluster, out) as connection:
         with logged_stage(seconds, "start"):
-            found = kept_ground(out, asked)
-            if found is None:
-                each = EachOnWorkers(connection, progress)
-                found = _found(opened, models, config, each, given)
-            ground, figures = found
-            used = {name: named[name] for name in figures["used"]}
-            level = str(geoid or "the WGS 84 ellipsoid")
-            swept = Swept(used, asked, level, figures | {"request": request})
-            job = _job(out, config, swept, ground, {name: inputs[name] for name in used})
-            job = replace(job, overwrite=overwrite)
+            job = sweep_job(asked, out, EachOnWorkers(connection, progress), overwrite=overwrite)
         with locked(out):
             report = complete_before(job) if not job.begin() else match_and_assemble(job, connection, seconds, progress)
-            if makes_ortho:
-                from sat_intervals.workflows.ortho import write_ortho
-
-                write_ortho(job, ground, ORTHO, progress)
+            if wanted.ortho:
+                make_ortho(job, progress)
             end_tiles(job, keep_tiles=keep_tiles)
     return report
 
 
-def _opened(images: Sequence[str | Path | Image]) -> list[Image]:
-    """Open three images or more, each given once."""
-    opened = [one if isinstance(one, Image) else open_image(one) for one in images]
-    if len(opened) < 3:
-        raise SatIntervalsError(f"{len(opened)} images are given: give three or more")
-    for number, one in enumerate(opened):
-        if (one.path, one.band) in [(other.path, other.band) for other in opened[:number]]:
+def asked_of(images: Sequence[Image], out: Path, config: Config, wanted: Wanted, *, overwrite: bool = False) -> Asked:
+    """Check all that can be checked before the geometry of a sweep is found."""
+    from sat_intervals.heights.dsm import checked_cells
+
+    config = resolved(config)
+    if not isinstance(config.cost, Sweep):
+        raise SatIntervalsError(f"cost.method is {config.cost.method}, which compares two images: give --preset many")
+    if not config.disparity.is_auto:
+        raise SatIntervalsError("a range of disparities is for two images: leave it out, or give heights")
+    _check_images(images, wanted)
+    grid, cell, crs, _ = checked_cells(wanted.resolution, wanted.crs, None, wanted.geoid)
+    check_folder(out, overwrite=overwrite, names=outputs_of(config))
+    named = {f"image_{number}": image for number, image in enumerate(images, start=1)}
+    inputs = describe_inputs(named, config, {})
+    outputs = [*outputs_of(config), *([ORTHO] if wanted.ortho else [])]
+    files = wanted.geoid, *wanted.models
+    like = [wanted.resolution] if isinstance(wanted.resolution, Path) else []
+    check_not_replaced([*identities(inputs), *files, *like], [out / name for name in outputs], [home_of(out)])
+    if wanted.ortho and read_report(out) is None:
+        check_free(out / ORTHO, overwrite=overwrite)
+    decisive = {
+        "made_by": [version("sat-intervals"), FINGERPRINT],
+        "inputs": inputs,
+        "settings": config.model_dump(mode="json", exclude={"cluster", "tiles", "products", "preset"}),
+        "given": [cell, grid and asdict(grid), crs, wanted.heights],
+        "files": [file and identity(str(file), {}) for file in files],
+    }
+    return Asked(named, config, wanted._replace(crs=crs), cell, grid, inputs, digest(plain(decisive)))
+
+
+def _check_images(images: Sequence[Image], wanted: Wanted) -> None:
+    """Raise unless each image is given once, a model of each or of none, and heights in order."""
+    for number, one in enumerate(images):
+        if (one.path, one.band) in [(other.path, other.band) for other in images[:number]]:
             raise SatIntervalsError(f"{one.path} is given twice: give each image once")
-    return opened
+    if wanted.models and len(wanted.models) != len(images):
+        raise SatIntervalsError(
+            f"{len(wanted.models)} models are given for {len(images)} images: give one of each image, or none"
+        )
+    if wanted.heights and not wanted.heights[0] < wanted.heights[1]:
+        low, high = wanted.heights
+        raise SatIntervalsError(f"heights are {low:g} to {high:g} m: give the lowest one, then the highest")
 
 
-def _complete_before(out: Path, request: str, *, keep_tiles: bool) -> dict[str, Any] | None:
+def complete_sweep(asked: Asked, out: Path, *, keep_tiles: bool) -> dict[str, Any] | None:
     """Return the report of a complete run of a request, and remove tiles that a death left; None without."""
     before = read_report(out)
-    if not before or before.get("sweep", {}).get("request") != request:
+    if not before or before.get("sweep", {}).get("request") != asked.request:
+        return None
+    if asked.wanted.ortho and not (out / ORTHO).exists():
         return None
     with locked(out):
         open_run(out)  # its files are there
@@ -184,18 +158,31 @@ def _complete_before(out: Path, request: str, *, keep_tiles: bool) -> dict[str, 
     return before
 
 
-def _found(
-    images: Sequence[Image], models: Sequence[str | Path | None], config: Config, each: Each, given: _Given
-) -> tuple[GroundViews, dict[str, Any]]:
-    """Find the geometry of a sweep; return it and what ``run.json`` has of it."""
+def sweep_job(asked: Asked, out: Path, each: Each, *, overwrite: bool = False, pair: str = "") -> Job:
+    """Make the job of a sweep in a folder, with the geometry that is there, or is found."""
+    geometry = kept_ground(out, asked.digest) or found_geometry(asked, each)
+    return replace(job_of_geometry(asked, out, geometry, pair=pair), overwrite=overwrite)
+
+
+def make_ortho(job: Job, progress: Progress) -> None:
+    """Write the ortho-image of a finished sweep."""
+    from sat_intervals.workflows.ortho import write_ortho
+
+    assert job.prepared.ground
+    write_ortho(job, job.prepared.ground, ORTHO, progress)
+
+
+def found_geometry(asked: Asked, each: Each) -> Geometry:
+    """Find the geometry of a sweep."""
     from sat_intervals.heights.views import sensors_of
     from sat_intervals.workflows.ground import found_ground
 
-    sensors = sensors_of(images, models)
+    images, wanted = list(asked.images.values()), asked.wanted
+    sensors = sensors_of(images, wanted.models)
     middle = sensors[0].model
-    projection = Projection(given.crs or utm_of(middle.offset_x, middle.offset_y), given.geoid)
+    projection = Projection(wanted.crs or utm_of(middle.offset_x, middle.offset_y), wanted.geoid)
     projection.check(middle.offset_x, middle.offset_y)
-    plan = found_ground(sensors, projection, given.resolution, config, each, given.heights, given.grid)
+    plan = found_ground(sensors, projection, asked.cell, asked.config, each, wanted.heights, asked.grid)
     search = plan.config.disparity
     ends = [plan.ground.base + plan.ground.step * end for end in (search.minimum, search.maximum)]
     of_images = [
@@ -218,10 +205,16 @@ def _found(
     )
 
 
-def _job(out: Path, config: Config, swept: Swept, ground: GroundViews, inputs: dict[str, Any]) -> Job:
+def job_of_geometry(asked: Asked, out: Path, geometry: Geometry, region: Window | None = None, pair: str = "") -> Job:
     """Make the job of a sweep whose geometry is known: its left image is the grid of cells."""
-    figures = swept.report
-    minimum, maximum = figures["disparities"]
+    ground, figures = geometry
+    swept = Swept(
+        {name: asked.images[name] for name in figures["used"]},
+        asked.digest,
+        str(asked.wanted.geoid or "the WGS 84 ellipsoid"),
+        figures | {"request": asked.request},
+    )
+    config, (minimum, maximum) = asked.config, figures["disparities"]
     changes = {"minimum": minimum, "maximum": maximum}
     config = config.model_copy(update={"disparity": config.disparity.model_copy(update=changes)})
     cells = figures["cells"]
@@ -230,5 +223,7 @@ def _job(out: Path, config: Config, swept: Swept, ground: GroundViews, inputs: d
     frame = Image(name, 1, cells["rows"], cells["columns"], "float32", None, False, None, None, place)
     ranges = figures["ranges"] and LocalRanges.of_report(figures["ranges"])
     prepared = Prepared(FilePair(frame, frame), config, None, None, None, ranges, None, ground=ground)
-    requested = config.disparity.model_dump(mode="json")
-    return job_of(prepared, out, inputs, requested, Window(0, 0, cells["rows"], cells["columns"]), swept=swept)
+    inputs = {name: asked.inputs[name] for name in swept.images}
+    requested = asked.config.disparity.model_dump(mode="json")
+    region = region or Window(0, 0, cells["rows"], cells["columns"])
+    return job_of(prepared, out, inputs, requested, region, pair=pair, swept=swept)

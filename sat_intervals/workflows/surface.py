@@ -1,4 +1,4 @@
-"""Two images to a surface model: raw images are rectified, the pair is matched, its points are gridded."""
+"""Images to a surface model: of two an epipolar pair is matched and its points are gridded, more go by a sweep."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -16,6 +16,7 @@ from sat_intervals.raster import Image, check_not_replaced, files_of, open_image
 from sat_intervals.run.pair import match_pair
 from sat_intervals.run.state import OUTPUTS
 from sat_intervals.tiling import Window
+from sat_intervals.workflows.many import Wanted, surface_of_many
 from sat_intervals.workflows.rectify import rectify
 
 # What is made of a run, in its folder.
@@ -35,8 +36,7 @@ class Epipolar(NamedTuple):
 
 
 def surface(
-    left: str | Path | Image,
-    right: str | Path | Image,
+    images: Sequence[str | Path | Image],
     out: str | Path,
     config: Any = None,
     *,
@@ -45,7 +45,9 @@ def surface(
     radius: float | None = None,
     geoid: str | Path | None = None,
     choices: SurfaceChoices | None = None,
-    sensors: Sequence[str | Path] = (),
+    heights: tuple[float, float] | None = None,
+    ortho: bool = False,
+    sensors: Sequence[str | Path | None] = (),
     dem: str | Path | None = None,
     altitude: float | None = None,
     resolution_of: str | None = None,
@@ -55,35 +57,48 @@ def surface(
     progress: Progress = lambda stage, done, total: None,
     on_rectified: Rectified = lambda record: None,
 ) -> dict[str, Any]:
-    """Make a surface model with height intervals of two images: `rectify`, `match_pair` and `make_surface` in one.
+    """Make a surface model with height intervals of two images, or of three and more at once.
 
-    To resume, call it again: what is finished with these images and settings is kept, the surface is made again.
+    Two images: `rectify`, `match_pair` and `make_surface` in one. More: images are resampled to the ground at each
+    height and compared there; semi-global matching chooses the heights (METHOD.md, section 20), and the models are
+    shifted to fit each other. To resume, call it again: what is finished with these images and settings is kept.
 
     Parameters
     ----------
-    left, right
-        Raw images with RPC models, which become the epipolar pair ``out/left.tif``, ``out/right.tif``; or an epipolar
-        pair with the models and grids of its raw images. Paths, or images opened by `open_image`.
+    images
+        Raw images with RPC models, two or more; of two, left and right, ``out`` has the epipolar pair ``left.tif``,
+        ``right.tif``. Or an epipolar pair with the models and grids of its raw images. Paths, or images opened by
+        `open_image`.
     out
-        Folder for the files of all three steps; the surface model is ``out/dsm.tif``.
-    config, window, keep_tiles, overwrite
-        As for `match_pair`; a ``window`` is a region of an epipolar image.
-    resolution, crs, radius, geoid, choices
+        Folder for the files of all steps; the surface model is ``out/dsm.tif``.
+    config, keep_tiles, overwrite
+        As for `match_pair`; of three images or more the preset is ``many`` by default, and others need its ``cost``.
+    resolution, crs, geoid
         As for `make_surface`.
     sensors
-        Left and right RPC model and, of an epipolar pair, left and right grid, see `set_geometry`. By default the
+        RPC models of the images; of an epipolar pair left and right model and grid, see `set_geometry`. By default the
         models that belong to raw images, and what `rectify` has noted of its pair.
+    radius, choices
+        Of two images, as for `make_surface`.
     dem, altitude, resolution_of
-        Of raw images, as for `rectify`; the heights of ``dem`` refer to ``geoid``.
+        Of two raw images, as for `rectify`; the heights of ``dem`` refer to ``geoid``.
+    window
+        Of an epipolar pair: region of the left image.
+    heights
+        Of three images or more: lowest and highest height of the ground, metres above ``geoid`` or the ellipsoid; by
+        default found.
+    ortho
+        Of three images or more: whether to write ``out/ortho.tif``, their median, resampled to the surface.
     progress
         Callback, see `Progress`.
     on_rectified
-        Called with what `rectify` returns, as soon as raw images are an epipolar pair.
+        Called with what `rectify` returns, as soon as two raw images are an epipolar pair.
 
     Returns
     -------
-    ``rectify``, ``run`` and ``surface``, what the three steps return, the first None of an epipolar pair; and
-    ``warnings``, lines of all steps.
+    Of two images ``rectify``, ``run`` and ``surface``, what the three steps return, the first None of an epipolar pair;
+    and ``warnings``, lines of all steps. Of more the content of ``run.json``, with ``warnings``, too; ``sweep`` has
+    the shifts (pixels) and likeness of the images, those left out, the grid, heights and their step.
 
     Raises
     ------
@@ -92,17 +107,22 @@ def surface(
     RunError
         Tiles failed; no output was published.
     """
-    config, out = load_config(config), Path(out)
-    check_cost(config)
-    cells = {"resolution": resolution, "crs": crs, "radius": radius, "geoid": geoid and Path(geoid)}
-    choices = choices or SurfaceChoices()
-    check_cells(cells, choices, resolved(config).interval)
-    left, right = (one if isinstance(one, Image) else open_image(one) for one in (left, right))
-    raw = {"dem": dem, "altitude": altitude, "resolution_of": resolution_of, "geoid": geoid if dem else None}
+    opened = [one if isinstance(one, Image) else open_image(one) for one in images]
+    config, out, geoid = load_config(config, images=len(opened)), Path(out), Path(geoid) if geoid else None
+    choices, raw = choices or SurfaceChoices(), {"dem": dem, "altitude": altitude, "resolution_of": resolution_of}
+    of_points = None if choices == SurfaceChoices() else choices
+    of_two = raw | {"window": window, "radius": radius, "a choice of points": of_points}
+    _check_number(len(opened), of_two, {"heights": heights, "ortho": ortho or None})
     how: dict[str, Any] = {"overwrite": overwrite, "progress": progress}
-    pair = epipolar_pair(left, right, out, sensors, window, on_rectified, **raw, **how)
+    if len(opened) > 2:
+        wanted = Wanted(resolution, crs, geoid, heights, sensors, ortho)
+        return surface_of_many(opened, out, config, wanted, keep_tiles=keep_tiles, **how)
+    check_cost(config)
+    cells = {"resolution": resolution, "crs": crs, "radius": radius, "geoid": geoid}
+    check_cells(cells, choices, resolved(config).interval)
+    pair = epipolar_pair(opened, out, sensors, window, on_rectified, geoid=geoid if dem else None, **raw, **how)
     grid = files_of(str(resolution)) if isinstance(resolution, Path) else ()
-    read = [file for one in (left, right) for file in (one.path, one.mask)]
+    read = [file for one in opened for file in (one.path, one.mask)]
     results = [out / name for name in (*OUTPUTS, *FILES)]
     check_not_replaced([*read, *pair.sensors, geoid, *grid], results, [out / "tiles"])
     check_sensors(pair.sensors, resolution, crs)
@@ -111,6 +131,16 @@ def surface(
     doubts = pair.record["warnings"] if pair.record else []
     warnings = [*doubts, *run["warnings"], *geometry_warnings(made["geometry"])]
     return {"rectify": pair.record, "run": run, "surface": made, "warnings": warnings}
+
+
+def _check_number(count: int, of_two: Mapping[str, Any], of_more: Mapping[str, Any]) -> None:
+    """Raise for fewer than two images, and for options that only two of them have, or only more."""
+    if count < 2:
+        raise SatIntervalsError(f"images: {count} given, a surface needs two or more")
+    options, whose = (of_more, "three images or more") if count == 2 else (of_two, "two images")
+    for name, value in options.items():
+        if value is not None:
+            raise SatIntervalsError(f"{name} is for {whose}: leave it out")
 
 
 def check_cells(cells: Mapping[str, Any], choices: SurfaceChoices, interval: Interval | None) -> None:
@@ -125,16 +155,15 @@ def surface_of(out: Path, sensors: Sequence[Path], progress: Progress, **cells: 
     return make_surface([out], out / "dsm.tif", **cells, progress=progress)
 
 
-def has_grids(sensors: Sequence[str | Path] | None) -> bool:
+def has_grids(sensors: Sequence[str | Path | None] | None) -> bool:
     """Return whether there are grids beside models."""
     return len(sensors or ()) > len(IMAGES)
 
 
 def epipolar_pair(
-    left: Image,
-    right: Image,
+    images: Sequence[Image],
     out: Path,
-    sensors: Sequence[str | Path],
+    sensors: Sequence[str | Path | None],
     window: Window | None,
     on_rectified: Rectified,
     **raw: Any,
@@ -143,7 +172,10 @@ def epipolar_pair(
 
     ``raw`` are further arguments of `rectify`.
     """
-    files = tuple(map(Path, sensors)) if has_grids(sensors) else rectified_files(left.path, right.path)
+    left, right = images
+    files = (
+        tuple(Path(file) for file in sensors if file) if has_grids(sensors) else rectified_files(left.path, right.path)
+    )
     if files:
         given = [name for name in ("dem", "altitude", "resolution_of") if raw.get(name) is not None]
         if sensors and not has_grids(sensors):

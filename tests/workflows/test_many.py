@@ -11,11 +11,10 @@ from helpers import COMMAND, invoke, refused, wait_until
 from raw import raw_pair
 from sweeps import OPTIONS, WORDS
 
-from sat_intervals import SatIntervalsError
+from sat_intervals import SatIntervalsError, surface
 from sat_intervals.demo import make_scene
 from sat_intervals.products import SURFACE
 from sat_intervals.raster import Georeferencing, read_layers, write_layer
-from sat_intervals.workflows.many import surface_of_many
 
 pytestmark = pytest.mark.peer("shareloc")
 
@@ -56,17 +55,17 @@ def test_surface_of_many__bands_are_those_of_every_surface(sweep):
 
 def test_surface_of_many__has_the_same_bytes_for_any_tiles_and_says_that_it_was_complete(sweep, tmp_path, caplog):
     out, settings = tmp_path / "out", {"preset": "many", "tiles": {"size": 64}}
-    report = surface_of_many(sweep.images, out, settings, **OPTIONS, keep_tiles=True)
+    report = surface(sweep.images, out, settings, **OPTIONS, keep_tiles=True)
     assert (out / "tiles" / "tiles").is_dir()
     assert files_of(out) == files_of(sweep.out)
     assert json.loads((out / "run.json").read_text()) == report
-    assert surface_of_many(sweep.images, out, settings, **OPTIONS) == report
+    assert surface(sweep.images, out, settings, **OPTIONS) == report
     assert f"the run in {out} was already complete" in caplog.text
     assert "complete" in invoke("status", out).stdout
     assert not (out / "tiles").exists()
     (out / "dsm.tif").unlink()
     with pytest.raises(SatIntervalsError, match=r"dsm.tif"):
-        surface_of_many(sweep.images, out, settings, **OPTIONS)
+        surface(sweep.images, out, settings, **OPTIONS)
 
 
 @pytest.mark.process
@@ -94,14 +93,16 @@ def test_surface_of_many__survives_kill_9_and_has_the_same_bytes_on_processes(sw
 
 def test_surface_of_many__refuses_what_it_cannot_use(sweep, tmp_path):
     out = tmp_path / "out"
-    with pytest.raises(SatIntervalsError, match="2 images are given: give three or more"):
-        surface_of_many(sweep.images[:2], out, **OPTIONS)
+    with pytest.raises(SatIntervalsError, match="images: 1 given, a surface needs two or more"):
+        surface(sweep.images[:1], out, **OPTIONS)
+    with pytest.raises(SatIntervalsError, match="2 models are given for 5 images: give one of each image, or none"):
+        surface(sweep.images, out, **OPTIONS, sensors=sweep.images[:2])
     with pytest.raises(SatIntervalsError, match=r"cost.method is census, .* compares two images: give --preset many"):
-        surface_of_many(sweep.images, out, {"preset": "satellite"}, **OPTIONS)
+        surface(sweep.images, out, {"preset": "satellite"}, **OPTIONS)
     own = tmp_path / "dsm.tif"
     shutil.copy(sweep.images[3], own)
     with pytest.raises(SatIntervalsError, match=r"dsm.tif is .*input"):
-        surface_of_many([*sweep.images[:3], own], tmp_path, **OPTIONS, overwrite=True)
+        surface([*sweep.images[:3], own], tmp_path, **OPTIONS, overwrite=True)
     bare = tmp_path / "bare.tif"
     write_layer(bare, read_layers(sweep.images[0])[0], 0, Georeferencing())
     refused(
@@ -119,16 +120,17 @@ def test_surface__of_many_refuses_options_of_pairs(sweep, tmp_path):
     model = ("--left-model", "a", "--right-model", "b")
     given = model, ("--window", 0, 0, 50, 50), ("--radius", 2), ("--altitude", 20), ("--nodata", "0,1")
     for words in given:
-        refused((*command, *words), f"{words[0]}", " is for two images: leave it out")
-    refused((*command, "--disparity", 0, 9), "--disparity is for two images: leave it out")
-    refused((*command, "--outliers", 2), "an option for points is for two images: leave it out")
+        refused((*command, *words), f"{words[0].removeprefix('--')}", " is for two images: leave it out")
+    refused((*command, "--disparity", 0, 9), "a range of disparities is for two images: leave it out")
+    refused((*command, "--outliers", 2), "a choice of points is for two images: leave it out")
     refused((*command, "--preset", "satellite"), "cost.method is census, which compares two images: give --preset many")
 
 
 def test_surface__of_two_images_goes_the_way_of_pairs(tmp_path):
     images = raw_pair(tmp_path / "raw", make_scene(120, 150, seed=4))
     command = "surface", *images, tmp_path / "out", "--resolution", 1
-    refused((*command, "--heights", 0, 50), "--heights and --ortho are for three images or more")
+    refused((*command, "--heights", 0, 50), "heights is for three images or more: leave it out")
+    refused((*command, "--ortho"), "ortho is for three images or more: leave it out")
     refused((*command, "--preset", "many"), "compares many images")
     assert not (tmp_path / "out").exists()
     result = invoke(*command, "--altitude", 20)

@@ -23,12 +23,12 @@ def test_surface__gives_the_bytes_of_the_command_and_resumes(tmp_path):
     assert invoke("surface", *pair, tmp_path / "command", *words).exit_code == 0
     of_command = (tmp_path / "command" / "dsm.tif").read_bytes()
     kinds = {"resolution": 1.0, "choices": choices, "sensors": sensors}
-    again = sat_intervals.surface(*pair, tmp_path / "command", search, **kinds)  # the same run: its time is in a tag
+    again = sat_intervals.surface(pair, tmp_path / "command", search, **kinds)  # the same run: its time is in a tag
     assert (tmp_path / "command" / "dsm.tif").read_bytes() == of_command
-    done = sat_intervals.surface(*map(str, pair), str(tmp_path / "call"), search, **kinds)
+    done = sat_intervals.surface([*map(str, pair)], str(tmp_path / "call"), search, **kinds)
     assert hashes(tmp_path / "call") == hashes(tmp_path / "command")
     assert_array_equal(*(read_layers(tmp_path / name / "dsm.tif") for name in ("call", "command")))
     assert (done["rectify"], done["surface"]["points"]) == (None, again["surface"]["points"])
     assert done["warnings"] == done["run"]["warnings"]
     with pytest.raises(SatIntervalsError, match="altitude is for raw images"):
-        sat_intervals.surface(*pair, tmp_path / "call", search, **kinds, altitude=20)
+        sat_intervals.surface(pair, tmp_path / "call", search, **kinds, altitude=20)
