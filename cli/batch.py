@@ -21,10 +21,12 @@ def batch(pairs: Path, out: Path, settings: SettingsArguments, run: RunArguments
 
     Columns: name, left, right, minimum, maximum, left_mask, right_mask, nodata, band, window, and any setting such as
     sgm.p2. Rows with resolution also produce a surface model, as `surface` does: of raw images with RPC models, or of
-    an epipolar pair with left_model, right_model, left_grid, right_grid. A failed pair does not stop the others.
-    OUT/batch.json has the state of each pair; the exit status is 1 if any failed.
+    an epipolar pair with left_model, right_model, left_grid, right_grid; further columns crs, radius, geoid, dem,
+    altitude, resolution_of. Rows with images, names or patterns separated by spaces, in place of left and right make
+    the surface of them, of three and more all at once; further columns crs, geoid, heights, ortho. A failed pair does
+    not stop the others. OUT/batch.json has the state of each pair; the exit status is 1 if any failed.
     """
-    from sat_intervals.config.pairs import REPORT, read_batch
+    from sat_intervals.config.batch import REPORT, read_batch
     from sat_intervals.heights.geometry import geometry_warnings
     from sat_intervals.raster.identity import check_not_replaced
     from sat_intervals.workflows.batch import match_batch
@@ -50,7 +52,7 @@ def batch(pairs: Path, out: Path, settings: SettingsArguments, run: RunArguments
     run.say(report)
     console.batch_summary(report)
     of_surfaces = [
-        line for end in report.values() if "surface" in end for line in geometry_warnings(end["surface"]["geometry"])
+        line for end in report.values() for line in geometry_warnings(end.get("surface", {}).get("geometry", {}))
     ]
     warn(of_surfaces)
     done = ("done", "done before")

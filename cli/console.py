@@ -171,7 +171,8 @@ class Console:
             counts = end.get("counts")
             width = counts and counts["median_interval_width"]
             valid = _share(counts["valid"], counts["pixels"]) if counts else ""
-            row = [name, end["state"], valid, f"{width:.2f} px" if width is not None else ""]
+            in_pixels = width is not None and "step" not in surfaces.get(name, {})  # else in steps of height
+            row = [name, end["state"], valid, f"{width:.2f} px" if in_pixels else ""]
             if name in surfaces:
                 half = surfaces[name]["median_half_width"]
                 row += [f"{100 * surfaces[name]['filled']:.1f} %", f"+-{half:.2f} m" if half is not None else ""]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sat_intervals.config.pairs import REPORT
+from sat_intervals.config.batch import REPORT
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster import BLOCK
 from sat_intervals.store.lock import is_locked

@@ -1,4 +1,4 @@
-"""Match many pairs on one cluster, with tiles of several pairs in flight, and make their surface models."""
+"""Match many pairs on one cluster, with tiles of several pairs in flight, and make surface models of pairs or more."""
 
 import logging
 import resource
@@ -10,16 +10,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sat_intervals.config import load_config, named_files, read_yaml
-from sat_intervals.config.pairs import REPORT, PairOfBatch
+from sat_intervals.config import Config, load_config, named_files, read_yaml
+from sat_intervals.config.batch import REPORT, PairOfBatch
 from sat_intervals.config.presets import merged
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.dsm import check_sensors
+from sat_intervals.prepare.pair import Each
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, OutputError, files_of, open_image
 from sat_intervals.raster.identity import check_not_replaced
 from sat_intervals.raster.publishing import write_record
+from sat_intervals.results import open_run
 from sat_intervals.run.assemble import end_tiles
 from sat_intervals.run.connection import Connection
 from sat_intervals.run.each import EachOnWorkers
@@ -30,10 +32,13 @@ from sat_intervals.run.status import read_report
 from sat_intervals.run.workers import Workers
 from sat_intervals.store.lock import locked
 from sat_intervals.tiling import Window
+from sat_intervals.workflows.many import ORTHO, Wanted, asked_of, complete_sweep, make_ortho, sweep_job
 from sat_intervals.workflows.surface import FILES, Rectified, check_cells, epipolar_pair, has_grids, surface_of
 
 _LOG = logging.getLogger(__name__)
-_KEPT = "finished", "counts", "seconds", "warnings"  # of a run's report, in `batch.json`
+# Of a run's report, in `batch.json`, and of its sweep.
+_KEPT = "finished", "counts", "seconds", "warnings"
+_KEPT_OF_SWEEP = "crs", "cells", "heights", "step", "images", "left_out"
 
 
 def match_batch(
@@ -50,9 +55,10 @@ def match_batch(
     """Match many pairs on one cluster; a failed pair does not stop the others.
 
     Each pair has a folder in ``out``. ``config`` and ``overrides`` are for all pairs; a pair's own settings win. One
-    with a resolution also gets a surface model, its raw images are rectified as by `surface`. Returns, as
-    ``batch.json`` has it, by name: ``state`` ("waiting", "done", "done before", "failed"), and ``error`` or
-    ``finished``, ``counts``, ``seconds``, ``warnings`` and ``surface``, what `make_surface` returns.
+    with a resolution also gets a surface model, its raw images are rectified as by `surface`; of more images the
+    surface is made as by `surface`. Returns, as ``batch.json`` has it, by name: ``state`` ("waiting", "done", "done
+    before", "failed"), and ``error`` or ``finished``, ``counts``, ``seconds``, ``warnings`` and ``surface``, what
+    `make_surface` returns, of more images grid, heights and shifts.
     """
     file = Path(config) if isinstance(config, (str, Path)) else None
     sections = read_yaml(Path(config)) if isinstance(config, (str, Path)) else config  # once for all pairs
@@ -68,11 +74,11 @@ def match_batch(
             for number, pair in enumerate(pairs):
                 progress("pairs", number, len(pairs))
                 try:
-                    images = surfaces.epipolar(pair, _opened(pair))
-                    own = merged(overrides or {}, pair.settings)
-                    settings = load_config(sections, own, preset_wins=True, file=file)
-                    how: dict[str, Any] = {"overwrite": overwrite, "pair": pair.name, "each": each}
-                    job = open_job(*images, out / pair.name, settings, window=_window(pair), **how)
+                    own, count = merged(overrides or {}, pair.settings), len(pair.images)
+                    settings = load_config(sections, own, preset_wins=True, file=file, images=count)
+                    if (job := surfaces.job(pair, settings, each, keep_tiles=keep_tiles)) is None:
+                        report.note({pair.name: _ended("done before", open_run(out / pair.name).report)})
+                        continue
                     stack.enter_context(locked(job.out))
                     if job.begin():
                         jobs[pair.name] = job
@@ -113,10 +119,12 @@ class _Report:
 def _check_not_replaced(pairs: Sequence[PairOfBatch], others: Sequence[str | Path | None], out: Path) -> None:
     """Raise if an input of any pair, or another file that is read, is an output of any pair."""
     folders = [out / pair.name for pair in pairs]
-    images = [name for pair in pairs for name in (pair.left, pair.right, pair.left_mask, pair.right_mask)]
+    images = [name for pair in pairs for name in (*pair.images, pair.left_mask, pair.right_mask)]
+    files = [pair.options.get(name) for pair in pairs for name in ("geoid", "dem")]
     named = [name for pair in pairs for name in (*(pair.sensors or ()), *named_files(pair.settings))]
-    read = [file for name in {str(name) for name in (*others, *images, *named) if name} for file in _files(name)]
-    surfaces = [out / pair.name / name for pair in pairs if pair.resolution for name in FILES]
+    names = {str(name) for name in (*others, *images, *named, *files) if name}
+    read = [file for name in names for file in _files(name)]
+    surfaces = [out / pair.name / name for pair in pairs if pair.resolution for name in (*FILES, ORTHO)]
     outputs = [out / REPORT, *(folder / name for folder in folders for name in OUTPUTS), *surfaces]
     check_not_replaced(read, outputs, [folder / "tiles" for folder in folders])
 
@@ -136,51 +144,76 @@ class _Surfaces:
         self._out, self._on_rectified, self._how = out, on_rectified, how
         self._sensors: dict[str, Sequence[Path]] = {}
         self._errors: dict[str, SatIntervalsError] = {}
+        self._orthos: dict[str, Job] = {}
         of_surfaces = [pair for pair in pairs if pair.resolution]
         if of_surfaces:
             import sat_intervals.heights.sensors  # noqa: F401 (without its extra it raises, for all pairs)
         for pair in of_surfaces:
             try:
-                check_cells(_cells(pair), SurfaceChoices(), None)
+                if not pair.more:
+                    check_cells(_cells(pair), SurfaceChoices(), None)
                 if has_grids(pair.sensors):
-                    check_sensors(pair.sensors or (), _cells(pair)["resolution"], None)
+                    check_sensors(pair.sensors or (), _cells(pair)["resolution"], pair.options.get("crs"))
             except SatIntervalsError as error:
                 self._errors[pair.name] = error
                 _LOG.warning("%s: there will be no surface: %s", pair.name, error)
 
-    def epipolar(self, pair: PairOfBatch, images: tuple[Image, Image]) -> tuple[Image, Image]:
+    def job(self, pair: PairOfBatch, settings: Config, each: Each, *, keep_tiles: bool) -> Job | None:
+        """Return what is to be matched of a row; None of more images whose surface is there."""
+        out, overwrite = self._out / pair.name, self._how["overwrite"]
+        if not pair.more:
+            images, how = self._epipolar(pair, out), {"overwrite": overwrite, "pair": pair.name, "each": each}
+            return open_job(*images, out, settings, window=_window(pair), **how)
+        options: dict[str, Any] = {**pair.options}  # those of pairs are not there
+        wanted = Wanted(pair.resolution or 0.0, **options)
+        asked = asked_of(_opened(pair), out, settings, wanted, overwrite=overwrite)
+        if not overwrite and complete_sweep(asked, out, keep_tiles=keep_tiles):
+            return None
+        job = sweep_job(asked, out, each, overwrite=overwrite, pair=pair.name)
+        if wanted.ortho:
+            self._orthos[pair.name] = job
+        return job
+
+    def _epipolar(self, pair: PairOfBatch, out: Path) -> tuple[Image, Image]:
         """Return the images to match: those of a pair, or the epipolar pair of its raw images."""
+        images, sensors = _opened(pair), pair.sensors or ()
         if not pair.resolution:
-            return images
-        out, sensors = self._out / pair.name, pair.sensors or ()
-        made = epipolar_pair(images, out, sensors, _window(pair), self._on_rectified, **self._how)
+            return images[0], images[1]
+        raw = {name: pair.options.get(name) for name in ("dem", "altitude", "resolution_of")}
+        raw["geoid"] = pair.options.get("geoid") if raw["dem"] else None
+        made = epipolar_pair(images, out, sensors, _window(pair), self._on_rectified, **raw, **self._how)
         if not has_grids(sensors):
-            check_sensors(made.sensors, pair.resolution, None)
+            check_sensors(made.sensors, pair.resolution, pair.options.get("crs"))
         self._sensors[pair.name] = made.sensors
         return made.left, made.right
 
     def made(self, pair: PairOfBatch) -> dict[str, Any]:
-        """Make the surface of a matched pair; return what it adds to the pair's state."""
+        """Make the surface of a matched pair, or the ortho-image of more; return what it adds to the pair's state."""
         try:
             if pair.name in self._errors:
                 raise self._errors[pair.name]
             out, progress = self._out / pair.name, self._how["progress"]
-            return {"surface": surface_of(out, self._sensors[pair.name], progress, **_cells(pair))}
+            if not pair.more:
+                return {"surface": surface_of(out, self._sensors[pair.name], progress, **_cells(pair))}
+            if pair.name in self._orthos:
+                make_ortho(self._orthos[pair.name], progress)
+            return {}
         except Exception as error:  # one pair's failure must not stop the others
             return _failed(error)
 
 
 def _cells(pair: PairOfBatch) -> dict[str, Any]:
-    return {"resolution": pair.resolution, "crs": None, "radius": None}
+    return {"resolution": pair.resolution} | {name: pair.options.get(name) for name in ("crs", "radius", "geoid")}
 
 
-def _opened(pair: PairOfBatch) -> tuple[Image, Image]:
-    def opened(side: str, path: str, mask: str | None) -> Image:
-        names = "band", "nodata"
-        options: dict[str, Any] = {one: pair.reading.get(f"{side}_{one}", pair.reading.get(one)) for one in names}
+def _opened(pair: PairOfBatch) -> list[Image]:
+    reading, sides = pair.reading, [("left_", pair.left_mask), ("right_", pair.right_mask)]
+
+    def opened(path: str, side: str, mask: str | None) -> Image:
+        options: dict[str, Any] = {one: reading.get(f"{side}{one}", reading.get(one)) for one in ("band", "nodata")}
         return open_image(path, **options, mask=mask)
 
-    return opened("left", pair.left, pair.left_mask), opened("right", pair.right, pair.right_mask)
+    return [opened(path, *side) for path, side in zip(pair.images, sides + [("", None)] * len(pair.more), strict=True)]
 
 
 def _window(pair: PairOfBatch) -> Window | None:
@@ -190,7 +223,18 @@ def _window(pair: PairOfBatch) -> Window | None:
 def _done_before(job: Job, *, keep_tiles: bool) -> dict[str, Any]:
     before = complete_before(job)
     end_tiles(job, keep_tiles=keep_tiles)
-    return {"state": "done before"} | {key: before[key] for key in _KEPT}
+    return _ended("done before", before)
+
+
+def _ended(state: str, report: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the state of a finished run, of a sweep with figures of its surface."""
+    ended = {"state": state} | {name: report[name] for name in _KEPT}
+    if swept := report.get("sweep"):
+        counts, width = report["counts"], report["counts"]["median_interval_width"]
+        half = None if width is None else width * swept["step"] / 2
+        figures = {"filled": counts["valid"] / counts["pixels"], "median_half_width": half}
+        ended["surface"] = {name: swept[name] for name in _KEPT_OF_SWEEP} | figures
+    return ended
 
 
 def _failed(error: Exception) -> dict[str, Any]:
@@ -254,4 +298,4 @@ def _assembled(workers: Workers, progress: Progress, matched: Matched, *, keep_t
         end_tiles(job, keep_tiles=keep_tiles)
     except Exception as error:  # one pair's failure must not stop the others
         return _failed(error)
-    return {"state": "done", **{name: report[name] for name in _KEPT}}
+    return _ended("done", report)

@@ -10,7 +10,7 @@ import rasterio
 from helpers import COMMAND
 
 from sat_intervals import SatIntervalsError, load_config, match_arrays, open_image
-from sat_intervals.config.pairs import read_batch
+from sat_intervals.config.batch import read_batch
 from sat_intervals.evaluate.surface_accuracy import evaluate_surface
 from sat_intervals.products import SURFACE
 from sat_intervals.raster import Projection, read_window

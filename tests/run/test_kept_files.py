@@ -10,7 +10,7 @@ from finished import random_bands, write_run
 from helpers import VRT, contents, refused
 from rasterio.shutil import copy
 
-from sat_intervals.config.pairs import PairOfBatch
+from sat_intervals.config.batch import PairOfBatch
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.interop.export import export
 from sat_intervals.run.pair import match_pair

@@ -12,7 +12,7 @@ import yaml
 from helpers import LOCK, PLACE, hashes, invoke
 
 from sat_intervals.config import ConfigError, load_config
-from sat_intervals.config.pairs import PairOfBatch, read_batch
+from sat_intervals.config.batch import PairOfBatch, read_batch
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.sgm import LAST

@@ -1,6 +1,7 @@
 """Surfaces of many images in one call: accuracy, intervals, equal bytes, deaths, and what is refused."""
 
 import json
+import re
 import shutil
 import subprocess
 
@@ -12,9 +13,10 @@ from raw import raw_pair
 from sweeps import OPTIONS, WORDS
 
 from sat_intervals import SatIntervalsError, surface
-from sat_intervals.demo import make_scene
+from sat_intervals.demo import PIXEL, make_scene
 from sat_intervals.products import SURFACE
 from sat_intervals.raster import Georeferencing, read_layers, write_layer
+from sat_intervals.workflows.demo import CRS
 
 pytestmark = pytest.mark.peer("shareloc")
 
@@ -136,3 +138,53 @@ def test_surface__of_two_images_goes_the_way_of_pairs(tmp_path):
     result = invoke(*command, "--altitude", 20)
     assert result.exit_code == 0, result.output
     assert {"left.tif", "right.tif", "intervals.tif", "dsm.tif"} <= {path.name for path in (tmp_path / "out").iterdir()}
+
+
+def test_batch__makes_surfaces_of_many_images_beside_pairs_and_resumes(sweep, tmp_path):
+    folder, out = sweep.images[0].parent, tmp_path / "out"
+    common = {"resolution": PIXEL, "crs": CRS}
+    rows = [
+        {"name": "many", "images": f"{folder}/[1-5].tif", "ortho": True, "tiles.size": 256} | common,
+        {"name": "two", "images": [str(sweep.images[1]), str(sweep.images[3])], "altitude": 20} | common,
+        {"name": "broken", "images": f"{folder}/1.tif {folder}/2.tif nowhere.tif"} | common,
+    ]
+    (tmp_path / "rows.json").write_text(json.dumps(rows))
+    done = invoke("batch", tmp_path / "rows.json", out)
+    assert (done.exit_code, done.stderr.count("nowhere.tif")) == (1, 1), done.output
+    states = json.loads((out / "batch.json").read_text())
+    assert {name: end["state"] for name, end in states.items()} == {"many": "done", "two": "done", "broken": "failed"}
+    assert files_of(out / "many") == files_of(sweep.out)
+    assert states["many"]["surface"]["step"] == sweep.report["sweep"]["step"]
+    assert (out / "two" / "dsm.tif").exists()
+    shown = next(line for line in done.stdout.splitlines() if line.startswith("many"))
+    assert re.search(r"% +\+-[.0-9]+ m +0", shown)
+    assert "px" not in shown
+    (tmp_path / "rows.json").write_text(json.dumps(rows[:1]))
+    ortho = out / "many" / "ortho.tif"
+    before, made = files_of(out / "many"), ortho.stat().st_mtime_ns
+    for is_missing in (False, True):
+        assert invoke("batch", tmp_path / "rows.json", out).exit_code == 0
+        assert json.loads((out / "batch.json").read_text())["many"]["state"] == "done before"
+        assert files_of(out / "many") == before
+        assert (ortho.stat().st_mtime_ns != made) == is_missing
+        ortho.unlink()
+
+
+@pytest.mark.parametrize(
+    ("row", "problem"),
+    [
+        ({"images": "a.tif b.tif c.tif"}, "row 1 lacks resolution: a surface needs resolution"),
+        ({"images": "*.tif", "resolution": 1}, "row 1: images is '*.tif', which no file matches: give names, or a"),
+        ({"images": ["a.tif"], "resolution": 1}, "row 1: images: 1 given, a surface needs two or more"),
+        ({"images": "a b", "left": "a", "resolution": 1}, "row 1: give either images, or left and right"),
+        (
+            {"images": "a b", "heights": "0 9", "resolution": 1},
+            "row 1: heights is for three images or more: leave it out",
+        ),
+        ({"images": "a b c", "left_mask": "m", "resolution": 1}, "row 1: left_mask is for two images: leave it out"),
+        ({"images": "a b c", "heights": "0", "resolution": 1}, "row 1: heights is "),
+    ],
+)
+def test_batch__refuses_rows_of_images_that_it_cannot_use(tmp_path, row, problem):
+    (tmp_path / "rows.json").write_text(json.dumps([{"name": "x"} | row]))
+    refused(("batch", tmp_path / "rows.json", tmp_path / "out"), problem)
