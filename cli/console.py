@@ -136,26 +136,27 @@ class Console:
         if then:
             self.say(f"next: sat-intervals {then} {quote(str(out))}")
 
-    def summary_of_many(self, report: dict[str, Any], out: Path) -> None:
-        """Print the table at the end of a sweep of many images, its shifts and warnings."""
-        counts, swept = report["counts"], report["sweep"]
-        cells, step = swept["cells"], swept["step"]
+    def say_images(self, swept: dict[str, Any]) -> None:
+        """Print the shifts and likeness of the images of a sweep."""
         images = Table("image", "row", "column", "likeness", box=None, pad_edge=False)
         for one in swept["images"]:
             images.add_row(Path(one["path"]).name, *(f"{part:+.2f}" for part in one["shift"]), _likeness(one["alike"]))
         self.say("shifts of the models (px), and likeness to the other images (-1 to 1)")
         self._terminal.print(images)
+
+    def summary_of_many(self, report: dict[str, Any], out: Path) -> None:
+        """Print the table at the end of a sweep of many images, its shifts and warnings."""
+        counts, swept = report["counts"], report["sweep"]
+        self.say_images(swept)
         table = Table(show_header=False, box=None, pad_edge=False)
         table.add_column(style="bold")
         table.add_column(justify="right")
-        table.add_row("cells", f"{cells['rows']} x {cells['columns']} of {cells['resolution']:g} m in {swept['crs']}")
-        table.add_row(
-            "heights searched", f"{swept['heights'][0]:.0f} to {swept['heights'][1]:.0f} m, every {step:.2f} m"
-        )
+        for row in lines_of_grid(swept).items():
+            table.add_row(*row)
         seen = counts["pixels"] - counts["causes"]["left_window"]
         table.add_row("height, of cells that two images see", _share(counts["valid"], seen))
         width = counts["median_interval_width"]
-        table.add_row("median half width", "none" if width is None else f"+-{width * step / 2:.2f} m")
+        table.add_row("median half width", "none" if width is None else f"+-{width * swept['step'] / 2:.2f} m")
         table.add_row("time", f"{report['seconds']['total']:.1f} s")
         self._terminal.print(table)
         warn(report["warnings"])
@@ -181,6 +182,15 @@ class Console:
             table.add_row(*row, str(len(end.get("warnings", ()))) if counts else "")
         self._terminal.print(table)
         warn(f"{name}: {line}" for name, end in report.items() for line in end.get("warnings", ()))
+
+
+def lines_of_grid(swept: dict[str, Any]) -> dict[str, str]:
+    """Return the cells and heights of a sweep, by what they are."""
+    cells, (low, high) = swept["cells"], swept["heights"]
+    return {
+        "cells": f"{cells['rows']} x {cells['columns']} of {cells['resolution']:g} m in {swept['crs']}",
+        "heights searched": f"{low:.0f} to {high:.0f} m, every {swept['step']:.2f} m",
+    }
 
 
 def _likeness(alike: float | None) -> str:

@@ -14,14 +14,18 @@ from sat_intervals.cli.triangulate import say_geometry
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
 
-_CELL_OPTIONS = (
+_GRID_OPTIONS = (
     click.option("--resolution", type=float, metavar="METRES", help="Side of a cell; or give --grid-like."),
     click.option("--grid-like", type=options.FILE, help="North-up raster whose grid and CRS the surface takes."),
     click.option("--crs", metavar="EPSG", help="A projected CRS in metres; default the UTM zone of the points."),
+    click.option("--geoid", type=options.FILE, help="Geoid grid (GTX, GeoTIFF) that heights refer to."),
+)
+_CELL_OPTIONS = (
+    *_GRID_OPTIONS[:3],
     options.expert_option(
         "--radius", type=float, metavar="METRES", help="Reach of a point; default the side of a cell."
     ),
-    click.option("--geoid", type=options.FILE, help="Geoid grid (GTX, GeoTIFF) that heights refer to."),
+    _GRID_OPTIONS[3],
     options.expert_option(
         "--bounds",
         type=click.Choice(("envelope", "median")),
@@ -54,6 +58,20 @@ _CELL_OPTIONS = (
 )
 
 
+def grid_options(command: options.Command) -> options.Command:
+    """Add options for the grid of a surface, and what its heights refer to."""
+    return options.with_options(command, *_GRID_OPTIONS)
+
+
+def side_of(resolution: float | None, grid_like: Path | None) -> float | Path:
+    """Return the side of a cell, or the raster that has it; raise unless one of them is given."""
+    if resolution is not None and grid_like is None:
+        return resolution
+    if grid_like is not None and resolution is None:
+        return grid_like
+    raise click.UsageError("give either --resolution or --grid-like.")
+
+
 def cell_options(command: options.Command) -> options.Command:
     """Add options for the cells of a surface, beside a `calibration_option`: ``cells``, arguments of `make_surface`."""
 
@@ -63,14 +81,12 @@ def cell_options(command: options.Command) -> options.Command:
         choices = {name: given.pop(name) for name in names}
         calibration = given.pop("height_calibration")
         cells = {name: given.pop(name) for name in ("resolution", "crs", "radius", "geoid")}
-        like = given.pop("grid_like")
-        if (like is None) == (cells["resolution"] is None):
-            raise click.UsageError("give either --resolution or --grid-like.")
+        cells["resolution"] = side_of(cells["resolution"], given.pop("grid_like"))
         from sat_intervals.config import load_height_calibration
         from sat_intervals.heights.choices import SurfaceChoices
 
         choices["calibration"] = calibration and load_height_calibration(calibration)
-        cells |= {"resolution": like or cells["resolution"], "choices": SurfaceChoices(**choices)}
+        cells["choices"] = SurfaceChoices(**choices)
         return command(cells=cells, **given)
 
     return options.with_options(with_cells, *_CELL_OPTIONS)

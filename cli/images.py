@@ -122,3 +122,11 @@ def pair_options(command: Command, images: Decorator = image_options) -> Command
 
 
 many_options = partial(pair_options, images=gathered("pair", _of_many, _IMAGES, *_IMAGE_OPTIONS))
+
+heights_option = click.option(
+    "--heights",
+    type=float,
+    nargs=2,
+    metavar="MIN MAX",
+    help="Three images or more: heights of the ground, metres; default: found from the images.",
+)

@@ -1,41 +1,45 @@
 """``sat-intervals plan``: estimate tiles, memory, disk and time of a run."""
 
 from dataclasses import asdict
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.images import PairArguments, pair_options
+from sat_intervals.cli.dsm import grid_options, side_of
+from sat_intervals.cli.images import PairArguments, heights_option, many_options, refuse
 from sat_intervals.cli.matching import SettingsArguments, search_options
 from sat_intervals.cli.options import Grouped, json_option, log_options, say_json
 
 if TYPE_CHECKING:
+    from sat_intervals.config import Config
     from sat_intervals.run.plan import Plan
 
 
 @click.command(cls=Grouped, short_help="Estimate tiles, memory, disk and time of a run.")
 @search_options
-@pair_options
+@many_options
+@grid_options
+@heights_option
 @click.option(
     "--memory", metavar="SIZE", help="Memory of a worker, such as 4GB: tiles are made smaller until one fits."
 )
 @json_option
 @log_options
-def plan(pair: PairArguments, settings: SettingsArguments, memory: str | None, as_json: bool) -> None:
-    """Estimate tiles, memory, disk and time of matching LEFT and RIGHT.
+def plan(pair: PairArguments, settings: SettingsArguments, memory: str | None, as_json: bool, **grid: Any) -> None:
+    """Estimate tiles, memory, disk and time of matching LEFT and RIGHT, or of the surface of three images or more.
 
     The time comes from a sample matched at the centre, or elsewhere if there is no data. Options and settings are those
-    of match.
+    of match, or of surface, whose grid and heights are found.
     """
-    from sat_intervals.cli.console import Console
-    from sat_intervals.run.plan import plan as make_plan
+    from sat_intervals.cli.console import Console, lines_of_grid
     from sat_intervals.run.workers import parse_memory
 
-    config = settings.load()
+    config = settings.load(pair.count)
     limit = parse_memory(memory) if memory else None
     with Console(quiet=as_json) as console:
-        left, right = pair.open()
-        made = make_plan(left, right, config, window=pair.window, memory=limit, progress=console.progress)
+        made = _planned(pair, config, grid, memory=limit, progress=console.progress)
+        if made.sweep:
+            console.say_images(made.sweep)
     if as_json:
         say_json(asdict(made))
         return
@@ -45,8 +49,8 @@ def plan(pair: PairArguments, settings: SettingsArguments, memory: str | None, a
     is_exact = config.tiles.overlap == "exact"
     seams = "exact seams" if is_exact else f"overlap {config.tiles.overlap} px"
     at_once = "1 tile" if made.workers == 1 else f"{made.workers} tiles"
-    lines = {
-        "search range": f"{made.search_range[0]} to {made.search_range[1]} px",
+    lines = lines_of_grid(made.sweep) if made.sweep else {"search range": "{} to {} px".format(*made.search_range)}
+    lines |= {
         "tiles": f"{made.tiles} of {made.tile_size} px{smaller}, {seams}",
         f"extra work of the {'seams' if is_exact else 'overlap'}": f"{100 * made.extra_work:.0f} %",
         "memory of a worker": f"{made.worker_bytes / 1e6:.0f} MB{one}",
@@ -58,6 +62,22 @@ def plan(pair: PairArguments, settings: SettingsArguments, memory: str | None, a
         del lines["  with 1 tiles at once"]
     for name, value in lines.items():
         click.echo(f"{name + ':':<36}{value}")
+
+
+def _planned(pair: PairArguments, config: "Config", grid: dict[str, Any], **how: Any) -> "Plan":
+    """Plan the match of two images, or the surface of more on a grid."""
+    if not pair.more:
+        from sat_intervals.run.plan import plan as of_pair
+
+        refuse({f"--{name.replace('_', '-')}": value for name, value in grid.items()}, "three images or more")
+        left, right = pair.open()
+        return of_pair(left, right, config, window=pair.window, **how)
+    from sat_intervals.workflows.many import Wanted
+    from sat_intervals.workflows.plan import plan_of_many
+
+    refuse({"--window": pair.region}, "two images")
+    side = side_of(grid.pop("resolution"), grid.pop("grid_like"))
+    return plan_of_many(pair.open(), config, Wanted(side, **grid), **how)
 
 
 def _verdicts(plan: "Plan", limit: int | None, kind: str) -> tuple[str, str]:

@@ -7,18 +7,10 @@ from typing import Any
 import click
 
 from sat_intervals.cli.dsm import calibration_option, cell_options, say_surface
-from sat_intervals.cli.images import PairArguments, many_options, refuse
+from sat_intervals.cli.images import PairArguments, heights_option, many_options, refuse
 from sat_intervals.cli.matching import RunArguments, SettingsArguments, run_options, search_options
 from sat_intervals.cli.options import FILE, Grouped, sensor_options
 from sat_intervals.cli.rectify import raw_options, say_rectified
-
-heights_option = click.option(
-    "--heights",
-    type=float,
-    nargs=2,
-    metavar="MIN MAX",
-    help="Three images or more: heights of the ground, metres; default: found from the images.",
-)
 
 
 @click.command(cls=Grouped, short_help="Match two images or many and make a surface model.")

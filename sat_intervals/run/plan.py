@@ -1,6 +1,7 @@
 """Plan a run: tiles, work, memory, disk, and the time estimated from a sample."""
 
 import tempfile
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,10 @@ SAMPLE = 512
 
 @dataclass(frozen=True)
 class Plan:
-    """Resources that a run needs: pixels, bytes, seconds; ``workers`` tiles at once, ``together`` in one process."""
+    """Resources that a run needs: pixels, bytes, seconds; ``workers`` tiles at once, ``together`` in one process.
+
+    ``sweep`` is what was found of many images: grid, heights and their step, shifts.
+    """
 
     search_range: tuple[int, int]
     tile_size: int
@@ -35,6 +39,11 @@ class Plan:
     together_bytes: int
     disk_bytes: int
     seconds: float
+    sweep: dict[str, Any] | None = None
+
+
+Sample = Callable[[Path, Config, Window], dict[str, float]]
+"""Matches a window in a folder of its own; returns the seconds of the stages."""
 
 
 def plan(
@@ -58,6 +67,26 @@ def plan(
     if config.disparity.is_auto or config.disparity.is_local:
         found = prepared_here(left, right, config, progress, measures_rows=False)
         config = config.model_copy(update={"disparity": found.config.disparity})
+
+    def sample(out: Path, one: Config, window: Window) -> dict[str, float]:
+        return dict(match_pair(left, right, out, one, window=window, overwrite=True)["seconds"])
+
+    # Compiled once a machine: a part of the first plan, not of the run.
+    progress("kernels", 0, 1)
+    compile_kernels(config)
+    return planned((left, right), region, config, sample, memory=memory, workers=workers)
+
+
+def planned(
+    images: Sequence[Image],
+    region: Window,
+    config: Config,
+    sample: Sample,
+    *,
+    memory: int | None = None,
+    workers: int | None = None,
+) -> Plan:
+    """Estimate what a run needs whose search range is known, see `plan`."""
     config = fitted_to_jobs(config) if memory is None else fitted(config, memory, waiting=readers(config.cluster))
     workers = workers or tiles_at_once(config.cluster)
     strip = min(BLOCK, region.height), region.width
@@ -65,10 +94,7 @@ def plan(
         check_strips(*strip, config, memory)
     check_tiles(config, region)
     grid = Grid(region, config.tiles.size)
-    # Compiled once a machine: a part of the first plan, not of the run.
-    progress("kernels", 0, 1)
-    compile_kernels(config)
-    seconds, extra = _expected(left, right, config, workers, grid)
+    seconds, extra = _expected(sample, config, workers, grid)
     together = workers if config.cluster.kind == "threads" else cores_of_process(config.cluster)
     waiting = readers(config.cluster) * waiting_bytes(config)
     task = max(tile_bytes(config), strip_bytes(*strip, config))
@@ -81,7 +107,7 @@ def plan(
         worker_bytes=PROCESS_BYTES + waiting + task,
         together=together,
         together_bytes=PROCESS_BYTES + waiting + together * task,
-        disk_bytes=sum(disk_bytes(grid, config, (left, right))),
+        disk_bytes=sum(disk_bytes(grid, config, images)),
         seconds=seconds,
     )
 
@@ -99,7 +125,7 @@ def _work(grid: Grid, config: Config) -> int:
     return sum(core.height + patch(core).height for core in rows) * sum(patch(core).width for core in columns) // 2
 
 
-def _expected(left: Image, right: Image, config: Config, workers: int, grid: Grid) -> tuple[float, float]:
+def _expected(sample: Sample, config: Config, workers: int, grid: Grid) -> tuple[float, float]:
     """Estimate the seconds of a run from a sample, and its extra work."""
     one = config.model_copy(update={"cluster": Cluster(workers=1)})  # also without the store of the run
     shape = SAMPLE, SAMPLE
@@ -108,7 +134,7 @@ def _expected(left: Image, right: Image, config: Config, workers: int, grid: Gri
         one = one.model_copy(update={"tiles": config.tiles.model_copy(update={"size": size})})
         shape = size, 2 * size
     with tempfile.TemporaryDirectory() as folder:
-        window, seconds = _sampled(left, right, Path(folder) / "sample", one, grid.region, shape)
+        window, seconds = _sampled(sample, Path(folder) / "sample", one, grid.region, shape)
     pixels = grid.region.height * grid.region.width
     larger = pixels / (window.height * window.width)
     of_tiles = sum(seconds.get(f"tiles.{stage}", 0.0) for stage in ("read", "pixels", "costs", "match", "write"))
@@ -116,25 +142,25 @@ def _expected(left: Image, right: Image, config: Config, workers: int, grid: Gri
     tiles = of_tiles * work / _work(Grid(window, one.tiles.size), one)
     # In the sample one of two tiles hands states on, in four wavefronts; in the run all but the last do, in three.
     paths = 1.5 * larger * seconds.get("tiles.trace", 0.0) * (1 - 1 / len(grid))
-    once = sum(seconds[stage] for stage in ("start", "kernels", "inputs"))  # of whole images
+    once = sum(seconds.get(stage, 0.0) for stage in ("start", "kernels", "inputs"))  # of whole images
     strips = larger * seconds["bands"] / min(workers, -(-grid.region.height // BLOCK))
     extra = paths / tiles if config.hands_states_on else work / pixels - 1
     return once + (tiles + paths) / min(workers, len(grid)) + strips + larger * seconds["files"], extra
 
 
 def _sampled(
-    left: Image, right: Image, out: Path, config: Config, region: Window, shape: tuple[int, int]
+    sample: Sample, out: Path, config: Config, region: Window, shape: tuple[int, int]
 ) -> tuple[Window, dict[str, float]]:
     """Match a sample at the centre, or elsewhere if that has no data; return its window and the seconds."""
     height, width = min(shape[0], region.height), min(shape[1], region.width)
     for share in (0.5, 0.25, 0.75, 0.0, 1.0):
         row = region.row + round(share * (region.height - height))
         column = region.column + round(share * (region.width - width))
-        sample = Window(row, column, height, width)
+        window = Window(row, column, height, width)
         try:
-            return sample, match_pair(left, right, out, config, window=sample, overwrite=True)["seconds"]
+            return window, sample(out, config, window)
         except RunError as error:  # its advice to resume does not apply to a sample
-            raise RunError(f"a sample of the pair cannot be matched: {reason(error.__cause__ or error)}") from error
+            raise RunError(f"a sample cannot be matched: {reason(error.__cause__ or error)}") from error
         except SatIntervalsError as error:
             last = error
     raise last

@@ -32,13 +32,11 @@ from sat_intervals.run.status import read_report
 from sat_intervals.run.workers import Workers
 from sat_intervals.store.lock import locked
 from sat_intervals.tiling import Window
-from sat_intervals.workflows.many import ORTHO, Wanted, asked_of, complete_sweep, make_ortho, sweep_job
+from sat_intervals.workflows.many import FIGURES, ORTHO, Wanted, asked_of, complete_sweep, make_ortho, sweep_job
 from sat_intervals.workflows.surface import FILES, Rectified, check_cells, epipolar_pair, has_grids, surface_of
 
 _LOG = logging.getLogger(__name__)
-# Of a run's report, in `batch.json`, and of its sweep.
-_KEPT = "finished", "counts", "seconds", "warnings"
-_KEPT_OF_SWEEP = "crs", "cells", "heights", "step", "images", "left_out"
+_KEPT = "finished", "counts", "seconds", "warnings"  # of a run's report, in `batch.json`
 
 
 def match_batch(
@@ -233,7 +231,7 @@ def _ended(state: str, report: Mapping[str, Any]) -> dict[str, Any]:
         counts, width = report["counts"], report["counts"]["median_interval_width"]
         half = None if width is None else width * swept["step"] / 2
         figures = {"filled": counts["valid"] / counts["pixels"], "median_half_width": half}
-        ended["surface"] = {name: swept[name] for name in _KEPT_OF_SWEEP} | figures
+        ended["surface"] = {name: swept[name] for name in FIGURES} | figures
     return ended
 
 

@@ -1,7 +1,7 @@
 """Make a surface model of many raw images at once: plane sweep and semi-global matching in object space."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -33,6 +33,8 @@ from sat_intervals.store.tiles import home_of
 from sat_intervals.tiling import Window
 
 ORTHO = "ortho.tif"
+# Of the figures of a geometry, those for batches and plans.
+FIGURES = "crs", "cells", "heights", "step", "images", "left_out"
 
 _LOG = logging.getLogger(__name__)
 
@@ -161,7 +163,7 @@ def complete_sweep(asked: Asked, out: Path, *, keep_tiles: bool) -> dict[str, An
 def sweep_job(asked: Asked, out: Path, each: Each, *, overwrite: bool = False, pair: str = "") -> Job:
     """Make the job of a sweep in a folder, with the geometry that is there, or is found."""
     geometry = kept_ground(out, asked.digest) or found_geometry(asked, each)
-    return replace(job_of_geometry(asked, out, geometry, pair=pair), overwrite=overwrite)
+    return replace(geometry_job(asked, out, geometry, pair=pair), overwrite=overwrite)
 
 
 def make_ortho(job: Job, progress: Progress) -> None:
@@ -205,7 +207,13 @@ def found_geometry(asked: Asked, each: Each) -> Geometry:
     )
 
 
-def job_of_geometry(asked: Asked, out: Path, geometry: Geometry, region: Window | None = None, pair: str = "") -> Job:
+def with_range(config: Config, figures: Mapping[str, Any]) -> Config:
+    """Return settings with the steps of height that a geometry has."""
+    changes = dict(zip(("minimum", "maximum"), figures["disparities"], strict=True))
+    return config.model_copy(update={"disparity": config.disparity.model_copy(update=changes)})
+
+
+def geometry_job(asked: Asked, out: Path, geometry: Geometry, region: Window | None = None, pair: str = "") -> Job:
     """Make the job of a sweep whose geometry is known: its left image is the grid of cells."""
     ground, figures = geometry
     swept = Swept(
@@ -214,10 +222,7 @@ def job_of_geometry(asked: Asked, out: Path, geometry: Geometry, region: Window 
         str(asked.wanted.geoid or "the WGS 84 ellipsoid"),
         figures | {"request": asked.request},
     )
-    config, (minimum, maximum) = asked.config, figures["disparities"]
-    changes = {"minimum": minimum, "maximum": maximum}
-    config = config.model_copy(update={"disparity": config.disparity.model_copy(update=changes)})
-    cells = figures["cells"]
+    config, cells = with_range(asked.config, figures), figures["cells"]
     place = north_up(figures["crs"], cells["left"], cells["top"], cells["resolution"])
     name = str((out / outputs_of(config)[0]).absolute())
     frame = Image(name, 1, cells["rows"], cells["columns"], "float32", None, False, None, None, place)

@@ -188,3 +188,24 @@ def test_batch__makes_surfaces_of_many_images_beside_pairs_and_resumes(sweep, tm
 def test_batch__refuses_rows_of_images_that_it_cannot_use(tmp_path, row, problem):
     (tmp_path / "rows.json").write_text(json.dumps([{"name": "x"} | row]))
     refused(("batch", tmp_path / "rows.json", tmp_path / "out"), problem)
+
+
+def test_plan__of_many_images_finds_grid_and_heights_and_takes_a_sample(sweep, tmp_path):
+    result = invoke("plan", *sweep.images, *WORDS, "--tile-size", 64, "--memory", "4GB", "--workers", 1)
+    assert result.exit_code == 0, result.stderr
+    swept = sweep.report["sweep"]
+    rows, columns = (swept["cells"][side] for side in ("rows", "columns"))
+    low, high = swept["heights"]
+    assert f"{rows} x {columns} of 0.5 m in {CRS}\n" in result.stdout
+    assert f"{low:.0f} to {high:.0f} m, every {swept['step']:.2f} m\n" in result.stdout
+    assert re.search(r"tiles: +16 of 64 px, exact seams\n", result.stdout)
+    assert re.search(r"memory of a worker: +\d+ MB, fits in 4000 MB\n", result.stdout)
+    assert re.search(r"expected time, 1 tile at once: +\d+ s", result.stdout)
+    assert all(re.search(rf"{one.name} +[-+]", result.stdout) for one in sweep.images)
+
+
+def test_plan__refuses_options_of_another_number_of_images(sweep):
+    refused(("plan", *sweep.images[:3]), "give either --resolution or --grid-like")
+    refused(("plan", *sweep.images[:3], *WORDS, "--window", 0, 0, 9, 9), "--window is for two images: leave it out")
+    refused(("plan", *sweep.images[:2], *WORDS), "--resolution is for three images or more: leave it out")
+    refused(("plan", sweep.images[0]), "give two images or more")
