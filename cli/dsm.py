@@ -65,11 +65,10 @@ def grid_options(command: options.Command) -> options.Command:
 
 def side_of(resolution: float | None, grid_like: Path | None) -> float | Path:
     """Return the side of a cell, or the raster that has it; raise unless one of them is given."""
-    if resolution is not None and grid_like is None:
-        return resolution
-    if grid_like is not None and resolution is None:
-        return grid_like
-    raise click.UsageError("give either --resolution or --grid-like.")
+    side = resolution if grid_like is None else grid_like
+    if side is None or None not in (resolution, grid_like):
+        raise click.UsageError("give either --resolution or --grid-like.")
+    return side
 
 
 def cell_options(command: options.Command) -> options.Command:

@@ -1,6 +1,5 @@
 """Options shared by the commands that take images: two or many, masks, no-data values, bands, the region to match."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -34,13 +33,9 @@ class PairArguments:
 
         return Window(*self.region) if self.region else None
 
-    @property
-    def count(self) -> int:
-        """Return the number of images."""
-        return 2 + len(self.more)
-
     def open(self) -> "list[Image]":
         """Open all images; what was given for one side goes with two images only."""
+        from sat_intervals.errors import check_absent
         from sat_intervals.raster import open_image
 
         nodata, band = self.nodata or (None, None), self.band or (None, None)
@@ -50,19 +45,12 @@ class PairArguments:
             two["--nodata LEFT,RIGHT"], two["--band LEFT,RIGHT"] = (
                 None if both[0] == both[1] else both for both in (nodata, band)
             )
-            refuse(two, "two images")
+            check_absent(two, "two images")
         names, sides = (self.left, self.right, *self.more), (0, 1, *[0] * len(self.more))
         return [
             open_image(name, band=band[side], nodata=nodata[side], mask=masks[side])
             for name, side in zip(names, sides, strict=True)
         ]
-
-
-def refuse(given: Mapping[str, Any], whose: str) -> None:
-    """Raise for the first of some options that is given, with None for others."""
-    for name, value in given.items():
-        if value is not None:
-            raise click.UsageError(f"{name} is for {whose}: leave it out.")
 
 
 class _Both(click.ParamType):  # type: ignore[type-arg,unused-ignore]

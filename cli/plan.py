@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from sat_intervals.cli.dsm import grid_options, side_of
-from sat_intervals.cli.images import PairArguments, heights_option, many_options, refuse
+from sat_intervals.cli.images import PairArguments, heights_option, many_options
 from sat_intervals.cli.matching import SettingsArguments, search_options
 from sat_intervals.cli.options import Grouped, json_option, log_options, say_json
 
@@ -34,7 +34,7 @@ def plan(pair: PairArguments, settings: SettingsArguments, memory: str | None, a
     from sat_intervals.cli.console import Console, lines_of_grid
     from sat_intervals.run.workers import parse_memory
 
-    config = settings.load(pair.count)
+    config = settings.load(2 + len(pair.more))
     limit = parse_memory(memory) if memory else None
     with Console(quiet=as_json) as console:
         made = _planned(pair, config, grid, memory=limit, progress=console.progress)
@@ -66,16 +66,18 @@ def plan(pair: PairArguments, settings: SettingsArguments, memory: str | None, a
 
 def _planned(pair: PairArguments, config: "Config", grid: dict[str, Any], **how: Any) -> "Plan":
     """Plan the match of two images, or the surface of more on a grid."""
+    from sat_intervals.errors import check_absent
+
     if not pair.more:
         from sat_intervals.run.plan import plan as of_pair
 
-        refuse({f"--{name.replace('_', '-')}": value for name, value in grid.items()}, "three images or more")
+        check_absent({f"--{name.replace('_', '-')}": value for name, value in grid.items()}, "three images or more")
         left, right = pair.open()
         return of_pair(left, right, config, window=pair.window, **how)
     from sat_intervals.workflows.many import Wanted
     from sat_intervals.workflows.plan import plan_of_many
 
-    refuse({"--window": pair.region}, "two images")
+    check_absent({"--window": pair.region}, "two images")
     side = side_of(grid.pop("resolution"), grid.pop("grid_like"))
     return plan_of_many(pair.open(), config, Wanted(side, **grid), **how)
 

@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from sat_intervals.cli.dsm import calibration_option, cell_options, say_surface
-from sat_intervals.cli.images import PairArguments, heights_option, many_options, refuse
+from sat_intervals.cli.images import PairArguments, heights_option, many_options
 from sat_intervals.cli.matching import RunArguments, SettingsArguments, run_options, search_options
 from sat_intervals.cli.options import FILE, Grouped, sensor_options
 from sat_intervals.cli.rectify import raw_options, say_rectified
@@ -46,15 +46,16 @@ def surface(
 
     To resume, rerun the same command: what is finished with these images and settings is kept.
     """
+    from sat_intervals.errors import check_absent
     from sat_intervals.workflows.surface import FILES, surface
 
     if len(sensor_files) > 1:
         raise click.UsageError("give --left-model, --right-model, --left-grid and --right-grid once.")
     if pair.more:
-        refuse({"--left-model": sensor_files or None}, "two images")
+        check_absent({"--left-model": sensor_files or None}, "two images")
     images = pair.open()
     settings.check_kept(out, *(out / name for name in FILES))
-    config = settings.load(pair.count)
+    config = settings.load(len(images))
     with run.console() as console:
         done = surface(
             images,

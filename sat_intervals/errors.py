@@ -1,6 +1,8 @@
-"""Errors of the package, and the check that a path is a file."""
+"""Errors of the package, and checks of files and options that raise them."""
 
 import os
+from collections.abc import Mapping
+from typing import Any
 
 REPORT = "sat_intervals.report"
 """Name of the logger of the warnings of a run, which commands print below their table."""
@@ -27,3 +29,10 @@ def check_file(path: str | os.PathLike[str], remedy: str) -> None:
     if not os.path.isfile(path):
         reason = "is a folder" if os.path.isdir(path) else "no such file"
         raise SatIntervalsError(f"{os.fspath(path)}: {reason}: {remedy}")
+
+
+def check_absent(options: Mapping[str, Any], whose: str, place: str = "") -> None:
+    """Raise for the first of some options that is given, not None; ``place`` begins the message."""
+    for name, value in options.items():
+        if value is not None:
+            raise SatIntervalsError(f"{place}{name} is for {whose}: leave it out")

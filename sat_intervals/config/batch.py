@@ -16,7 +16,7 @@ from sat_intervals.config.files import load_yaml, set_by_name
 from sat_intervals.config.pairs import check_names, checked, read_rows, why
 from sat_intervals.config.settings import Config
 from sat_intervals.config.wording import known
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import SatIntervalsError, check_absent
 
 # Report of a batch, in its folder. No pair may have its name or that of the folder of job logs.
 REPORT = "batch.json"
@@ -29,8 +29,14 @@ _PATHS = ("left_mask", "right_mask", *_SENSORS, "geoid", "dem")
 # Numbers, or text with them.
 _SPLIT = BeforeValidator(lambda value: value.split() if isinstance(value, str) else value)
 _WINDOW = Annotated[tuple[int, int, int, int], _SPLIT]
-# Columns that only two images have, beside those of one side, or only more.
-_OF_TWO, _OF_MORE = ("window", "minimum", "maximum", "radius", "dem", "altitude", "resolution_of"), ("heights", "ortho")
+# Columns that only some rows have.
+_ONLY_OF = {
+    "two images": (
+        *("window", "minimum", "maximum", "radius", "dem", "altitude", "resolution_of", *_PATHS[:6]),
+        *("left_nodata", "right_nodata", "left_band", "right_band"),
+    ),
+    "three images or more": ("heights", "ortho"),
+}
 
 
 class Reading(TypedDict, total=False):
@@ -108,7 +114,8 @@ def _of_batch(place: str, row: dict[str, Any], file: Path) -> PairOfBatch:
         )
     is_surface = "images" in row
     left, right, *more = _images_of(place, row, file)
-    _check_number(place, 2 + len(more), row)
+    others = "two images" if more else "three images or more"
+    check_absent({key: row.get(key) for key in _ONLY_OF[others]}, others, f"{place}: ")
     row |= {key: _relative_to(file, str(row[key])) for key in _PATHS if key in row}
     values: dict[str, Any] = {
         key: row.pop(key) for key in ("left_mask", "right_mask", "window", "resolution") if key in row
@@ -155,14 +162,6 @@ def _images_of(place: str, row: dict[str, Any], file: Path) -> list[str]:
     if len(found) < 2:
         raise SatIntervalsError(f"{place}: images: {len(found)} given, a surface needs two or more")
     return found
-
-
-def _check_number(place: str, count: int, row: Mapping[str, Any]) -> None:
-    """Raise for columns that only two images have, or only more."""
-    for key in row:
-        if key in _OF_MORE if count == 2 else key in _OF_TWO or key.startswith(("left_", "right_")):
-            whose = "three images or more" if count == 2 else "two images"
-            raise SatIntervalsError(f"{place}: {key} is for {whose}: leave it out")
 
 
 def _check_surface(place: str, sensors: Mapping[str, str], resolution: Any) -> None:

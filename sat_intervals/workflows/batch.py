@@ -32,7 +32,7 @@ from sat_intervals.run.status import read_report
 from sat_intervals.run.workers import Workers
 from sat_intervals.store.lock import locked
 from sat_intervals.tiling import Window
-from sat_intervals.workflows.many import FIGURES, ORTHO, Wanted, asked_of, complete_sweep, make_ortho, sweep_job
+from sat_intervals.workflows.many import FIGURES, ORTHO, Wanted, asked_of, complete_sweep, sweep_job
 from sat_intervals.workflows.surface import FILES, Rectified, check_cells, epipolar_pair, has_grids, surface_of
 
 _LOG = logging.getLogger(__name__)
@@ -194,7 +194,9 @@ class _Surfaces:
             if not pair.more:
                 return {"surface": surface_of(out, self._sensors[pair.name], progress, **_cells(pair))}
             if pair.name in self._orthos:
-                make_ortho(self._orthos[pair.name], progress)
+                from sat_intervals.workflows.ortho import write_ortho
+
+                write_ortho(self._orthos[pair.name], progress)
             return {}
         except Exception as error:  # one pair's failure must not stop the others
             return _failed(error)

@@ -96,7 +96,9 @@ def surface_of_many(
         with locked(out):
             report = complete_before(job) if not job.begin() else match_and_assemble(job, connection, seconds, progress)
             if wanted.ortho:
-                make_ortho(job, progress)
+                from sat_intervals.workflows.ortho import write_ortho
+
+                write_ortho(job, progress)
             end_tiles(job, keep_tiles=keep_tiles)
     return report
 
@@ -164,14 +166,6 @@ def sweep_job(asked: Asked, out: Path, each: Each, *, overwrite: bool = False, p
     """Make the job of a sweep in a folder, with the geometry that is there, or is found."""
     geometry = kept_ground(out, asked.digest) or found_geometry(asked, each)
     return replace(geometry_job(asked, out, geometry, pair=pair), overwrite=overwrite)
-
-
-def make_ortho(job: Job, progress: Progress) -> None:
-    """Write the ortho-image of a finished sweep."""
-    from sat_intervals.workflows.ortho import write_ortho
-
-    assert job.prepared.ground
-    write_ortho(job, job.prepared.ground, ORTHO, progress)
 
 
 def found_geometry(asked: Asked, each: Each) -> Geometry:

@@ -10,19 +10,22 @@ from sat_intervals.progress import Progress
 from sat_intervals.raster import File, OutputWriter, read_layers, read_views
 from sat_intervals.run.job import Job
 from sat_intervals.tiling import Window
+from sat_intervals.workflows.many import ORTHO
 
 _BAND = Band("grey level", "", "median of the images, resampled to the surface; no data without a height")
 # Rows of a strip, and columns of a window in it.
 _ROWS, _COLUMNS = 128, 1024
 
 
-def write_ortho(job: Job, ground: GroundViews, name: str, progress: Progress) -> None:
+def write_ortho(job: Job, progress: Progress) -> None:
     """Write the ortho-image beside the surface of a finished run; an existing file is replaced."""
+    ground = job.prepared.ground
+    assert ground
     place, (rows, columns) = job.left.georeferencing, ground.shape
     surface = job.out / "dsm.tif"
     if not surface.exists():
         raise SatIntervalsError(f"{surface} is missing: run the same command with --overwrite")
-    file = File(name, "float32", float("nan"), (_BAND,))
+    file = File(ORTHO, "float32", float("nan"), (_BAND,))
     with OutputWriter(job.out, [file], rows, columns, place, {"SOFTWARE": "sat-intervals"}) as writer:
         for row in range(0, rows, _ROWS):
             progress("ortho", row, rows)

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sat_intervals.config import Interval, load_config, resolved
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import SatIntervalsError, check_absent
 from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.dsm import check_sensors, checked_cells, make_surface, surface_tags
 from sat_intervals.heights.geometry import geometry_warnings, set_geometry
@@ -97,8 +97,8 @@ def surface(
     Returns
     -------
     Of two images ``rectify``, ``run`` and ``surface``, what the three steps return, the first None of an epipolar pair;
-    and ``warnings``, lines of all steps. Of more the content of ``run.json``, with ``warnings``, too; ``sweep`` has
-    the shifts (pixels) and likeness of the images, those left out, the grid, heights and their step.
+    and ``warnings``, lines of all steps. Of more the content of ``run.json``, which has ``warnings``, too; its
+    ``sweep`` has the shifts (pixels) and likeness of the images, those left out, the grid, heights and their step.
 
     Raises
     ------
@@ -111,12 +111,14 @@ def surface(
     config, out, geoid = load_config(config, images=len(opened)), Path(out), Path(geoid) if geoid else None
     choices, raw = choices or SurfaceChoices(), {"dem": dem, "altitude": altitude, "resolution_of": resolution_of}
     of_points = None if choices == SurfaceChoices() else choices
-    of_two = raw | {"window": window, "radius": radius, "a choice of points": of_points}
-    _check_number(len(opened), of_two, {"heights": heights, "ortho": ortho or None})
+    if len(opened) < 2:
+        raise SatIntervalsError(f"images: {len(opened)} given, a surface needs two or more")
     how: dict[str, Any] = {"overwrite": overwrite, "progress": progress}
     if len(opened) > 2:
+        check_absent(raw | {"window": window, "radius": radius, "a choice of points": of_points}, "two images")
         wanted = Wanted(resolution, crs, geoid, heights, sensors, ortho)
         return surface_of_many(opened, out, config, wanted, keep_tiles=keep_tiles, **how)
+    check_absent({"heights": heights, "ortho": ortho or None}, "three images or more")
     check_cost(config)
     cells = {"resolution": resolution, "crs": crs, "radius": radius, "geoid": geoid}
     check_cells(cells, choices, resolved(config).interval)
@@ -131,16 +133,6 @@ def surface(
     doubts = pair.record["warnings"] if pair.record else []
     warnings = [*doubts, *run["warnings"], *geometry_warnings(made["geometry"])]
     return {"rectify": pair.record, "run": run, "surface": made, "warnings": warnings}
-
-
-def _check_number(count: int, of_two: Mapping[str, Any], of_more: Mapping[str, Any]) -> None:
-    """Raise for fewer than two images, and for options that only two of them have, or only more."""
-    if count < 2:
-        raise SatIntervalsError(f"images: {count} given, a surface needs two or more")
-    options, whose = (of_more, "three images or more") if count == 2 else (of_two, "two images")
-    for name, value in options.items():
-        if value is not None:
-            raise SatIntervalsError(f"{name} is for {whose}: leave it out")
 
 
 def check_cells(cells: Mapping[str, Any], choices: SurfaceChoices, interval: Interval | None) -> None:
