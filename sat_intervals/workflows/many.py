@@ -21,6 +21,7 @@ from sat_intervals.raster.identity import check_not_replaced, identities, identi
 from sat_intervals.raster.publishing import check_free
 from sat_intervals.results import open_run
 from sat_intervals.run.assemble import end_tiles
+from sat_intervals.run.beside import compiled_beside
 from sat_intervals.run.connection import Connection
 from sat_intervals.run.each import EachOnWorkers
 from sat_intervals.run.inputs import describe_inputs
@@ -90,7 +91,7 @@ def surface_of_many(
     if not overwrite and (before := complete_sweep(asked, out, keep_tiles=keep_tiles)):
         return before
     seconds = dict[str, float]()
-    with Connection(asked.config.cluster, out) as connection:
+    with compiled_beside(asked.config), Connection(asked.config.cluster, out) as connection:
         with logged_stage(seconds, "start"):
             job = sweep_job(asked, out, EachOnWorkers(connection, progress), overwrite=overwrite)
         with locked(out):
