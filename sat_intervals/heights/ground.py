@@ -10,8 +10,9 @@ import numpy as np
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.epipolar import MARGIN, STEP, shareloc_grids
 from sat_intervals.heights.models import SensorImage, common_heights, common_parts
-from sat_intervals.match.coarse import Step, match_level, reduced
-from sat_intervals.raster import BLOCK, read_window
+from sat_intervals.kernels.resampling import Step
+from sat_intervals.match.coarse import match_level
+from sat_intervals.raster import read_reduced
 from sat_intervals.tiling import Window
 
 try:
@@ -78,12 +79,7 @@ def ground_of(left: SensorImage, right: SensorImage) -> tuple[tuple[float, int] 
 
 def _epipolar(of: SensorImage, part: Window, nodes: np.ndarray, shape: tuple[int, int], step: int) -> np.ndarray:
     """Return the reduced epipolar image of a part of an image, float32, NaN where not usable."""
-    rows, columns = part.height // step, part.width // step
-    small, most = np.empty((rows, columns), np.float32), max(1, BLOCK // step)
-    for row in range(0, rows, most):
-        strip = small[row : row + most]
-        window = Window(part.row + row * step, part.column, len(strip) * step, columns * step)
-        strip[:] = reduced(*read_window(of.image, window), Step(step, step))
+    small = read_reduced(of.image, part, Step(step, step))
     at = np.indices(shape) / STEP + MARGIN
     first = of.origin[0] + part.row, of.origin[1] + part.column
     places = [(map_coordinates(nodes[..., i], at, order=1) - first[i]) / step - 0.5 for i in (0, 1)]

@@ -1,7 +1,7 @@
 """Match many images coarsely: a surface of a level, the ranges of the next one, and shifts of the images."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,14 +11,14 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.disparity import median
 from sat_intervals.kernels.resampling import resample
 from sat_intervals.kernels.row_offsets import AFTER, BEFORE
-from sat_intervals.match.ground import BLOCK, GroundViews, reduced
+from sat_intervals.match.ground import BLOCK, GroundViews
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.matching_cost import Given
 from sat_intervals.match.patch import PatchFrame, match_patch, patch_areas
 from sat_intervals.match.sweep import SweepCost
 from sat_intervals.prepare.pair import Each
-from sat_intervals.raster import Image, read_window
-from sat_intervals.tiling import Grid, View, Window
+from sat_intervals.raster import Image, read_reduced_views
+from sat_intervals.tiling import Grid, View, Views, Window
 
 try:
     from scipy.ndimage import maximum_filter, minimum_filter, shift, uniform_filter
@@ -34,8 +34,6 @@ _UNSURE = 0.1, 0.3
 _BESIDE, _MARGIN = 4, (2, 0.1)
 # Sample blocks for shifts along each side of the grid, and their side in cells.
 _SAMPLES, _SIDE = 3, 96
-# Pixels of an image that are read at once.
-_STRIP = 1 << 24
 # Cells of sample blocks that an image must show to be compared with the others.
 _FEWEST = 500
 # Cells over which grey values are made alike.
@@ -61,6 +59,10 @@ class Stack:
     def whole(self) -> Window:
         """Return all cells."""
         return Window(0, 0, *self.ground.shape)
+
+    def around(self, core: Window) -> "Stack":
+        """Return what matching a core needs: of a large grid it is a small part."""
+        return replace(self, ground=self.ground.within(core.grown(_OVERLAP, _OVERLAP)))
 
 
 class Surface(NamedTuple):
@@ -94,43 +96,33 @@ def match_core(stack: Stack, core: Window) -> Surface:
     return _matched(stack, core)[0]
 
 
-def _matched(stack: Stack, core: Window) -> tuple[Surface, list[View]]:
+def _matched(stack: Stack, core: Window) -> tuple[Surface, Views]:
     frame = PatchFrame(core, stack.whole, stack.whole)
     cost = SweepCost(stack.config, Given(ground=stack.ground, ranges=stack.ranges))
     areas = patch_areas(frame, stack.config, stack.ranges)
-    images = [_read(*one) for one in zip(stack.images, cost.windows(areas), stack.ground.reductions, strict=True)]
-    patch = match_patch(frame, cost.of_reduced(images, areas), stack.config, ranges=stack.ranges)
+    views = read_reduced_views(stack.images, cost.windows(areas), stack.ground.reductions)
+    patch = match_patch(frame, cost.of_areas(views, areas), stack.config, ranges=stack.ranges)
     inner = core.relative_to(patch.output).slices
     disparity, ambiguity = patch.raw.disparity[inner], patch.raw.ambiguity[inner]
     surface = Surface(disparity, (ambiguity / stack.config.largest_ambiguity).astype(np.float32))
-    return surface, images
-
-
-def _read(image: Image, window: Window, reduction: int) -> View:
-    """Read a window of an image, reduced, in strips of rows: a whole image would not fit in memory."""
-    place = Window(*(part // reduction for part in (window.row, window.column, window.height, window.width)))
-    pixels = np.full((place.height, place.width), np.float32(np.nan))
-    rows = max(1, _STRIP // (reduction**2 * max(1, place.width)))
-    first, last = max(0, -place.row), min(place.height, -(-image.height // reduction) - place.row)
-    for row in range(first, last, rows):
-        height = min(rows, last - row)
-        strip = Window(window.row + row * reduction, window.column, height * reduction, window.width)
-        pixels[row : row + height] = reduced(*read_window(image, strip), reduction)
-    return View(place, pixels, np.zeros((0, 0), np.uint8))
+    return surface, views
 
 
 def surface_of(stack: Stack, each: Each) -> Surface:
     """Match all cells of a level."""
     cores = [tile.core for tile in Grid(stack.whole, _TILE)]
     surface = Surface(*(np.full(stack.ground.shape, np.float32(np.nan)) for _ in Surface._fields))
-    for i, found in each(match_core, [(stack, core) for core in cores], "heights"):
+    for i, found in each(match_core, [(stack.around(core), core) for core in cores], "heights"):
         for target, part in zip(surface, found, strict=True):
             target[cores[i].slices] = part
     return surface
 
 
 def ranges_for(surface: Surface, stack: Stack, finer: Stack, factor: int) -> LocalRanges:
-    """Return the ranges of blocks of a level ``factor`` times as fine, whose grid begins at the same corner."""
+    """Return the ranges of blocks of a level ``factor`` times as fine, whose grid begins at the same corner.
+
+    Blocks that no two images show have one height.
+    """
     sure = surface.sure(_UNSURE[0])
     disparity = median(surface.disparity, sure, 3)
     rows, columns = (-(-size // BLOCK) for size in finer.ground.shape)
@@ -148,6 +140,8 @@ def ranges_for(surface: Surface, stack: Stack, finer: Stack, factor: int) -> Loc
         (ground.base - there.base + ground.step * end) / there.step for end in (least - margin, most + margin)
     )
     least, most = np.where(np.isnan(least), search.minimum, least), np.where(np.isnan(most), search.maximum, most)
+    nobody = ~there.shown([(image.height, image.width) for image in finer.images])
+    least[nobody] = most[nobody] = 0
     whole = (np.clip(end, search.minimum, search.maximum).astype(np.int16) for end in (np.floor(least), np.ceil(most)))
     first, last = whole
     return LocalRanges(first, last, BLOCK, BLOCK).clipped(search.minimum, search.maximum)
@@ -188,7 +182,7 @@ def sample(stack: Stack, core: Window) -> Sample:
 def samples_of(stack: Stack, each: Each) -> list[Sample]:
     """Match sample blocks, and resample the images to them."""
     cores = sample_cores(stack.whole)
-    found = dict(each(sample, [(stack, core) for core in cores], "shifts"))
+    found = dict(each(sample, [(stack.around(core), core) for core in cores], "shifts"))
     return [found[i] for i in range(len(cores))]
 
 

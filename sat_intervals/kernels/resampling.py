@@ -1,9 +1,10 @@
-"""Resample an image at positions that a grid gives: linear between its nodes, cubic (Keys) between pixels.
+"""Resample an image at positions that a grid gives: linear between its nodes, cubic (Keys) between pixels; reduce it.
 
 Letters: r row, c column of the result; i, j node; y, x part of the way to the next node; v, u position in the image.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -102,3 +103,35 @@ def resample_reduced(pixels, origin, nodes, step, first, rows, columns, scale):
                 value += down[a] * part
             result[r, c] = value / (down.sum() * across.sum())
     return result
+
+
+class Step(NamedTuple):
+    """Rows and columns of an image that a reduced pixel averages."""
+
+    rows: int
+    columns: int
+
+
+def reduced(pixels: np.ndarray, state: np.ndarray, step: Step) -> np.ndarray:
+    """Means of the usable pixels, state 0, of blocks of ``step`` pixels.
+
+    pixels, state: ``(rows, columns)``; unusable pixels are 0. Rows and columns that fill no block are dropped.
+    Returns float32, NaN where less than half of a block is usable.
+    """
+    sums, counts = pixels, (state == 0).view(np.uint8)
+    with np.errstate(over="ignore"):  # undeclared no data may be as large as a float32 can be
+        for axis, size in enumerate(step):
+            sums, counts = _added(sums, axis, size), _added(counts, axis, size)
+    return np.where(2 * counts >= step.rows * step.columns, sums / np.maximum(counts, 1), np.nan).astype(np.float32)
+
+
+def _added(array: np.ndarray, axis: int, size: int) -> np.ndarray:
+    """Sums of ``size`` rows (axis 0) or columns (1); adding whole arrays is faster than a sum over an axis."""
+    if size == 1:
+        return array
+    turned = array.swapaxes(0, axis)
+    stop = len(turned) // size * size
+    total = turned[:stop:size].copy(order="K")
+    for first in range(1, size):
+        total += turned[first:stop:size]
+    return total.swapaxes(0, axis)

@@ -14,6 +14,7 @@ from sat_intervals.config.sections import MOST_PIXELS
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.components import component_sizes
 from sat_intervals.kernels.disparity import median
+from sat_intervals.kernels.resampling import Step, reduced
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.whole import match_whole
 
@@ -51,13 +52,6 @@ _LOCAL_MARGIN = (2, 1)
 
 class NoRangeError(SatIntervalsError):
     """The images have too few consistent matches to determine the search range."""
-
-
-class Step(NamedTuple):
-    """Rows and columns of the image that a pixel of a level averages."""
-
-    rows: int
-    columns: int
 
 
 @dataclass(frozen=True)
@@ -157,31 +151,6 @@ def finest_step(rows: int, columns: int) -> Step:
 def _most_rows(rows: int) -> int:
     """Largest power of two that leaves `_ROWS` rows, at least 1."""
     return 1 << max(1, rows // _ROWS).bit_length() - 1
-
-
-def reduced(pixels: np.ndarray, state: np.ndarray, step: Step) -> np.ndarray:
-    """Means of the usable pixels, state 0, of blocks of ``step`` pixels.
-
-    pixels, state: ``(rows, columns)``; unusable pixels are 0. Rows and columns that fill no block are dropped.
-    Returns float32, NaN where less than half of a block is usable.
-    """
-    sums, counts = pixels, (state == 0).view(np.uint8)
-    with np.errstate(over="ignore"):  # undeclared no data may be as large as a float32 can be
-        for axis, size in enumerate(step):
-            sums, counts = _added(sums, axis, size), _added(counts, axis, size)
-    return np.where(2 * counts >= step.rows * step.columns, sums / np.maximum(counts, 1), np.nan).astype(np.float32)
-
-
-def _added(array: np.ndarray, axis: int, size: int) -> np.ndarray:
-    """Sums of ``size`` rows (axis 0) or columns (1); adding whole arrays is faster than a sum over an axis."""
-    if size == 1:
-        return array
-    turned = array.swapaxes(0, axis)
-    stop = len(turned) // size * size
-    total = turned[:stop:size].copy(order="K")
-    for first in range(1, size):
-        total += turned[first:stop:size]
-    return total.swapaxes(0, axis)
 
 
 def _coarser(image: np.ndarray, step: Step) -> np.ndarray:

@@ -6,18 +6,22 @@ of BLOCK x BLOCK cells, counted from the first cell: within a block the images m
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from sat_intervals.config import Config, Sweep
 from sat_intervals.kernels.plane_sweep import FINE, RADIUS, planes_of, sweep
 from sat_intervals.kernels.resampling import resample
 from sat_intervals.kernels.row_offsets import AFTER, BEFORE
-from sat_intervals.tiling import View, Views, Window
+from sat_intervals.tiling import View, Window
 
 # Side of a block in cells: views of satellites turn by less than a hundredth of a pixel within it.
 BLOCK = 64
+# Images that must see a cell.
+FEWEST = 2
 # Cells between nodes of a fine grid.
 _NODES = 16
 # Cells around those of a block that the fine grid needs: the window, and a cubic.
@@ -30,6 +34,7 @@ class GroundViews:
 
     places: ``(images, heights, rows, columns, 2)`` float64: row and column in each image, whose pixel centres are
         integers, of the first corners of blocks, and of the last ones, at heights.
+    first: row and column of the first of these blocks in the grid; no image shows other blocks.
     lowest, spacing: metres of the first height, and between heights.
     reductions: pixels along a side of each image that are averaged.
     pairs: ``(pairs, 2)`` int64: images to compare.
@@ -45,6 +50,7 @@ class GroundViews:
     base: float
     step: float
     shape: tuple[int, int]
+    first: tuple[int, int] = (0, 0)
 
     def shifted(self, shifts: np.ndarray) -> "GroundViews":
         """Return the views with rows and columns added to all positions, ``(images, 2)``."""
@@ -52,7 +58,7 @@ class GroundViews:
 
     def corners(self, image: int, block: tuple[int, int], disparities: np.ndarray) -> np.ndarray:
         """Return ``(n, 2, 2, 2)``: positions of a block's corners in an image, reduced, at disparities ``(n,)``."""
-        row, column = block
+        row, column = (one - first for one, first in zip(block, self.first, strict=True))
         at = (self.base + self.step * disparities - self.lowest) / self.spacing
         i = np.clip(np.floor(at).astype(int), 0, self.places.shape[1] - 2)
         of_levels = self.places[image, :, row : row + 2, column : column + 2]
@@ -64,7 +70,7 @@ class GroundViews:
         """Return ``(rows, columns, 2)``: positions in an image, reduced, of the cells of a window at disparities."""
         at = (self.base + self.step * disparity - self.lowest) / self.spacing
         rows, columns = np.mgrid[window.row : window.row_stop, window.column : window.column_stop]
-        axes = at, (rows + 0.5) / BLOCK, (columns + 0.5) / BLOCK
+        axes = at, (rows + 0.5) / BLOCK - self.first[0], (columns + 0.5) / BLOCK - self.first[1]
         whole, parts = [], []
         for axis, count in zip(axes, self.places.shape[1:4], strict=True):
             whole.append(np.clip(np.floor(axis).astype(int), 0, count - 2))
@@ -76,27 +82,49 @@ class GroundViews:
         reduction = self.reductions[image]
         return (found - (reduction - 1) / 2) / reduction
 
+    def _known(self, window: Window) -> Window:
+        """Return the blocks that a window of cells meets, of those whose places are known."""
+        ends = (window.row // BLOCK, window.column // BLOCK), (window.row_stop / BLOCK, window.column_stop / BLOCK)
+        rows, columns = self.places.shape[2:4]
+        return Window.around(*ends).clipped(Window(*self.first, rows - 1, columns - 1))
+
+    def within(self, window: Window) -> "GroundViews":
+        """Return the views of a window of cells only."""
+        known = self._known(window)
+        rows, columns = known.relative_to(Window(*self.first, 0, 0)).slices
+        places = self.places[:, :, rows.start : rows.stop + 1, columns.start : columns.stop + 1]
+        return replace(self, places=places, first=(known.row, known.column))
+
+    def shown(self, sizes: Sequence[tuple[int, int]]) -> np.ndarray:
+        """Return the blocks that two images, of ``sizes`` rows and columns, may show at some height: bool."""
+        corners = sliding_window_view(self.places, (2, 2), (2, 3))
+        low, high = (end((1, -2, -1)) for end in (corners.min, corners.max))
+        meets = (high >= 0) & (low <= np.array(sizes)[:, None, None, :])
+        found = np.zeros([-(-size // BLOCK) for size in self.shape], bool)
+        row, column = self.first
+        found[row : row + low.shape[1], column : column + low.shape[2]] = meets.all(axis=-1).sum(axis=0) >= FEWEST
+        return found
+
     def blocks(self, window: Window) -> Iterator[tuple[tuple[int, int], Window]]:
         """Yield the blocks that a window of cells meets, and their common part, counted from the block's first cell."""
-        for row in range(window.row // BLOCK, -(-window.row_stop // BLOCK)):
-            for column in range(window.column // BLOCK, -(-window.column_stop // BLOCK)):
+        known = self._known(window)
+        for row in range(known.row, known.row_stop):
+            for column in range(known.column, known.column_stop):
                 block = Window(row * BLOCK, column * BLOCK, BLOCK, BLOCK)
                 yield (row, column), block.clipped(window).relative_to(block)
 
     def windows(self, window: Window, minimum: int, maximum: int) -> tuple[Window, ...]:
-        """Return the window of each image that the costs of a window of cells over some disparities need."""
-        blocks, ends = [block for block, _ in self.blocks(window)], np.array([minimum, maximum], float)
+        """Return the window of each image, reduced, that the costs of a window of cells over disparities need."""
+        known, ends = self._known(window), np.array([minimum, maximum], float)
+        if not (known.height and known.width):
+            return (Window(0, 0, 0, 0),) * len(self.reductions)
+        rows, columns = {known.row, known.row_stop - 1}, {known.column, known.column_stop - 1}
         found = []
-        for image, reduction in enumerate(self.reductions):
-            places = np.array([self.corners(image, block, ends) for block in (blocks[0], blocks[-1])])
-            of_row = np.array([self.corners(image, (blocks[0][0], blocks[-1][1]), ends)])
-            of_column = np.array([self.corners(image, (blocks[-1][0], blocks[0][1]), ends)])
-            places = np.concatenate([places, of_row, of_column]).reshape(-1, 2)
+        for image in range(len(self.reductions)):
+            places = np.array([self.corners(image, block, ends) for block in product(rows, columns)]).reshape(-1, 2)
             cell = np.abs(np.diff(places.reshape(-1, 2, 2, 2), axis=1)).max() / BLOCK
             margin = 1 + AFTER + int(np.ceil(cell * 2 * (_AROUND + _NODES)))
-            least, most = np.floor(places.min(axis=0)) - margin, np.ceil(places.max(axis=0)) + margin
-            (row, column), (height, width) = (reduction * part.astype(int) for part in (least, most - least))
-            found.append(Window(int(row), int(column), int(height), int(width)))
+            found.append(Window.around(places.min(axis=0) - margin, places.max(axis=0) + margin))
         return tuple(found)
 
     def costs(
@@ -104,7 +132,7 @@ class GroundViews:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return costs of a part of a block at disparities, and which images see its cells, see `kernels.sweep`.
 
-        ``images`` are reduced, see `usable`. ``disparities`` are those of the whole block.
+        ``images`` are reduced. ``disparities`` are those of the whole block.
         """
         middle = disparities.size // 2
         moves, planes, sizes = np.empty((disparities.size, len(images), 2)), [], []
@@ -133,15 +161,6 @@ class GroundViews:
         """Return how many images see each cell, 0 where no pair to compare does."""
         compared = (seen[self.pairs[:, 0]] & seen[self.pairs[:, 1]]).any(axis=0)
         return np.where(compared, seen.sum(axis=0), 0).astype(np.uint8)
-
-    def usable(self, views: Views) -> list[View]:
-        """Return the reduced images, float32, with NaN where not usable; their windows count reduced pixels."""
-        found = []
-        for view, reduction in zip(views, self.reductions, strict=True):
-            pixels = reduced(view.pixels, view.state, reduction)
-            place = Window(view.window.row // reduction, view.window.column // reduction, *pixels.shape)
-            found.append(View(place, pixels, view.state))
-        return found
 
 
 def _nodes(there: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -175,20 +194,14 @@ def _fine(view: View, nodes: np.ndarray, first: np.ndarray, begin: np.ndarray, s
     )
 
 
-def reduced(pixels: np.ndarray, state: np.ndarray, reduction: int) -> np.ndarray:
-    """Return means of square blocks, float32, NaN where a pixel is not usable; sides are multiples of ``reduction``."""
-    usable = np.where(state == 0, pixels, np.nan).astype(np.float32)
-    return np.asarray(usable.reshape(len(usable) // reduction, reduction, -1, reduction).mean(axis=(1, 3)))
-
-
 def ground_of(report: dict[str, Any], arrays: Sequence[np.ndarray]) -> GroundViews:
     """Return the views of a report and arrays, see `report_of_ground`."""
     return GroundViews(
-        arrays[0], pairs=arrays[1], **report | {name: tuple(report[name]) for name in ("reductions", "shape")}
+        arrays[0], pairs=arrays[1], **report | {name: tuple(report[name]) for name in ("reductions", "shape", "first")}
     )
 
 
 def report_of_ground(ground: GroundViews) -> tuple[dict[str, Any], tuple[np.ndarray, np.ndarray]]:
     """Return what identifies views: a mapping for JSON, and arrays."""
-    names = "lowest", "spacing", "reductions", "base", "step", "shape"
+    names = "lowest", "spacing", "reductions", "base", "step", "shape", "first"
     return {name: getattr(ground, name) for name in names}, (ground.places, ground.pairs)

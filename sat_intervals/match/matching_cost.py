@@ -103,7 +103,7 @@ class MatchingCost:
     def of_areas(
         self, views: Views, areas: Sequence[Area], made: Sequence[np.ndarray] | None = None
     ) -> list[AreaCosts]:
-        """Compute the costs of areas; ``made`` are precomputed ones of an earlier call, ``Costs.left``."""
+        """Compute the costs of areas; ``made`` are precomputed ones of an earlier call, see `precomputed`."""
         raise NotImplementedError
 
     def _with_views(self, costs: Costs, area: Area, views: Views) -> AreaCosts:

@@ -6,8 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from sat_intervals.kernels.cost import Codes, census
+from sat_intervals.kernels.resampling import Step, reduced
 from sat_intervals.kernels.row_offsets import shift_equations
-from sat_intervals.match.coarse import Matches, Step, match_level, reduced, settings
+from sat_intervals.match.coarse import Matches, match_level, settings
 from sat_intervals.match.whole import cut, match_whole
 from sat_intervals.tiling import View, Window, facing
 

@@ -13,6 +13,7 @@ from sat_intervals.config import Config
 from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.kernels.sgm import LAST, WAVEFRONTS
 from sat_intervals.match.borders import sources
+from sat_intervals.match.local_ranges import LocalRanges, narrowed
 from sat_intervals.match.memory import tiles_together
 from sat_intervals.tiling import Grid, Tile
 
@@ -133,24 +134,27 @@ def _order(step: Step) -> tuple[int, int, int]:
     return step.block.grid_row, step.block.grid_column, -1 if step.wavefront is None else step.wavefront
 
 
-def handed_bytes(grid: Grid, config: Config, images: Iterable[Any], *, keeps_pixels: bool) -> int:
-    """Return the bytes, at most, that steps hand to each other: path states, pixels of images, precomputed costs."""
+def handed_bytes(grid: Grid, config: Config, images: Iterable[Any], ranges: LocalRanges | None = None) -> int:
+    """Return the bytes, at most, that steps hand to each other: path states, pixels of ``images``, costs."""
     if not config.hands_states_on or len(grid) == 1:
         return 0
-    height, width, count = grid.region.height, grid.region.width, config.disparity.count
-    views = 1 + config.matches_right_view
-    lines = grid.columns * height + grid.rows * width
-    states = 2 * len(WAVEFRONTS) * lines * padded_to_lanes(count) * np.dtype(np.uint16).itemsize
-    costs = config.cost.precomputed * height * width * count
-    kept = 0
-    if keeps_pixels:
-        blocks, support = blocks_of(grid, config), 2 * config.tiles.support
-        around = 2 * (config.cost.window // 2 + 1)
-        sizes = [np.dtype(image.dtype).itemsize for image in images]
-        if config.rows == "auto":
-            sizes[1] = max(sizes[1], np.dtype(np.float32).itemsize)  # of rows that were taken out
-        for image, size in zip(images, sizes, strict=True):
-            rows = min(image.height, height + support) + blocks.rows * around
-            columns = min(image.width, width + support) + blocks.columns * (around + views * count)
-            kept += rows * columns * (size + 1)  # with its state
-    return views * (states + costs) + kept
+    height, width, views = grid.region.height, grid.region.width, 1 + config.matches_right_view
+    handed = 0
+    for tile in grid:
+        core, count = tile.core, narrowed(ranges, tile.core.grown(1, 1).clipped(grid.region), config).disparity.count
+        states = (
+            2 * len(WAVEFRONTS) * (core.height + core.width) * padded_to_lanes(count) * np.dtype(np.uint16).itemsize
+        )
+        handed += views * (states + config.cost.precomputed * core.height * core.width * count)
+    if not config.cost.compares_two:  # costs hold all that steps need of the images
+        return handed
+    blocks, support = blocks_of(grid, config), 2 * config.tiles.support
+    around = 2 * (config.cost.window // 2 + 1)
+    for side, image in enumerate(images):
+        size = np.dtype(image.dtype).itemsize
+        if side and config.rows == "auto":
+            size = max(size, np.dtype(np.float32).itemsize)  # of rows that were taken out
+        rows = min(image.height, height + support) + blocks.rows * around
+        columns = min(image.width, width + support) + blocks.columns * (around + views * config.disparity.count)
+        handed += rows * columns * (size + 1)  # with its state
+    return handed

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from sat_intervals.kernels.resampling import Step, reduced
 from sat_intervals.match import coarse
-from sat_intervals.match.coarse import Found, NoRangeError, Step
+from sat_intervals.match.coarse import Found, NoRangeError
 from sat_intervals.match.memory import check_memory
 from sat_intervals.match.normalization import BLOCK, blocks
 from sat_intervals.match.warm_up import compile_kernels
@@ -50,7 +51,7 @@ def reduce_block(pair: Pair, side: int, block: Window, step: Step) -> tuple[np.n
     """Return a block of an image at the finest level, and its smallest usable pixel; runs on a worker."""
     _, pixels, state = pair.view(side, block)
     smallest = pixels.min(where=state == 0, initial=np.inf)
-    return coarse.reduced(pixels, state, step), float(smallest)
+    return reduced(pixels, state, step), float(smallest)
 
 
 def _reduced(pair: Pair, side: int, step: Step, each: Each) -> tuple[np.ndarray, float]:

@@ -13,7 +13,14 @@ from sat_intervals.raster.projection import Frame, Projection, Vertical, utm_of
 from sat_intervals.raster.publishing import OutputError, check_free, check_space, file_bytes, new_file, part_bytes
 from sat_intervals.raster.rpc import find_model, fitted_rpc, read_rpc_file
 from sat_intervals.raster.surfaces import ground_of, read_heights, read_place, surface_place
-from sat_intervals.raster.windows import Layer, read_small_layers, read_views, read_window
+from sat_intervals.raster.windows import (
+    Layer,
+    read_reduced,
+    read_reduced_views,
+    read_small_layers,
+    read_views,
+    read_window,
+)
 from sat_intervals.raster.writer import OutputWriter
 
 __all__ = [
@@ -22,6 +29,6 @@ __all__ = [
     "check_not_replaced", "check_pair", "check_space", "codec_versions", "compressed", "describe", "factors",
     "file_bytes", "files_of", "find_model", "fitted_rpc", "footprint", "ground_of", "halved", "is_ground", "new_file",
     "north_up", "open_image", "part_bytes", "points_file", "ranges_file", "read_heights", "read_known", "read_layers",
-    "read_place", "read_rpc_file", "read_shape", "read_small_layers", "read_tags", "read_views", "read_window",
-    "run_files", "surface_file", "surface_place", "truth_file", "utm_of", "write_layer",
+    "read_place", "read_reduced", "read_reduced_views", "read_rpc_file", "read_shape", "read_small_layers", "read_tags",
+    "read_views", "read_window", "run_files", "surface_file", "surface_place", "truth_file", "utm_of", "write_layer",
 ]  # fmt: skip

@@ -10,6 +10,7 @@ from rasterio.enums import Resampling
 from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.errors import InputError
+from sat_intervals.kernels.resampling import Step, reduced
 from sat_intervals.kernels.row_offsets import shift_rows
 from sat_intervals.products import MASKED, NO_DATA
 from sat_intervals.raster.images import Image, opened
@@ -18,6 +19,7 @@ from sat_intervals.tiling import View, Views, Window
 # Types whose values are all exact in float32.
 _FLOAT32_HOLDS = {"uint8", "int8", "uint16", "int16", "float16", "float32"}
 _EXACT = 2**53  # integers up to this are exact in float64
+_STRIP = 1 << 23  # pixels that are read at once to be reduced
 # Shares by which floats may differ from a no-data value as people write it, the second one above the third number.
 _DIGITS = {"float32": 1e-6}
 _FEW_DIGITS = 1e-3
@@ -41,6 +43,30 @@ def read_window(image: Image, window: Window) -> tuple[np.ndarray, np.ndarray]:
     row, rows, *places = image.rows.read(window.row, window.column, window.height, window.width)
     pixels, state = shift_rows(*_read_window(image, Window(row, window.column, rows, window.width)), *places)
     return pixels, state
+
+
+def read_reduced_views(images: Iterable[Image], windows: Iterable[Window], reductions: Iterable[int]) -> Views:
+    """Read a window of each image, reduced: windows count reduced pixels; pixels that are not usable are NaN."""
+    views = []
+    for image, window, size in zip(images, windows, reductions, strict=True):
+        place = Window(*(size * one for one in (window.row, window.column, window.height, window.width)))
+        pixels = read_reduced(image, place, Step(size, size))
+        views.append(View(window, pixels, np.isnan(pixels) * np.uint8(NO_DATA)))
+    return tuple(views)
+
+
+def read_reduced(image: Image, window: Window, step: Step) -> np.ndarray:
+    """Read means of blocks of ``step`` pixels, float32, see `reduced`; in strips, since all may not fit in memory."""
+    small = np.full((window.height // step.rows, window.width // step.columns), np.float32(np.nan))
+    inside = window.clipped(Window(0, 0, image.height, image.width)).relative_to(window)
+    first, last = inside.column // step.columns, min(small.shape[1], -(-inside.column_stop // step.columns))
+    column, width = window.column + first * step.columns, max(0, last - first) * step.columns
+    rows = max(1, _STRIP // (step.rows * max(1, width)))
+    for row in range(inside.row // step.rows, min(len(small), -(-inside.row_stop // step.rows)), rows):
+        part = small[row : row + rows, first:last]
+        strip = Window(window.row + row * step.rows, column, len(part) * step.rows, width)
+        part[:] = reduced(*read_window(image, strip), step)
+    return small
 
 
 def _read_window(image: Image, window: Window) -> tuple[np.ndarray, np.ndarray]:

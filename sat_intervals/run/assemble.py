@@ -169,7 +169,11 @@ def scale_of(job: Job, tables: Tables) -> ConfidenceScale:
 
 def _nothing_matched(job: Job, tables: Tables) -> SatIntervalsError:
     records = tables.records.values()
-    empty = [image.path for side, image in job.images.items() if not any(one["usable_pixels"][side] for one in records)]
+    empty = [
+        image.path
+        for side, image in job.images.items()
+        if not any(one["usable_pixels"].get(side, 1) for one in records)
+    ]
     search, window = job.config.disparity, job.config.cost.window
     reason = (
         f"all pixels of {' and '.join(empty)} are no data or masked"

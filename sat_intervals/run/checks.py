@@ -7,6 +7,7 @@ from sat_intervals.config import Config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.machine import usable_cores
 from sat_intervals.match.costs import check_cost
+from sat_intervals.match.local_ranges import LocalRanges, narrowed
 from sat_intervals.match.memory import check_memory, check_strips, fitted, strip_bytes, volume_bytes
 from sat_intervals.match.schedule import handed_bytes
 from sat_intervals.raster import BLOCK, Image, check_pair, file_bytes, open_image, part_bytes
@@ -52,7 +53,7 @@ def checked_region(left: Image, window: Window | None) -> Window:
     return window
 
 
-def check_tiles(config: Config, region: Window) -> None:
+def check_tiles(config: Config, region: Window, ranges: LocalRanges | None = None) -> None:
     """Raise if tiles and strips do not fit in the memory of this machine or of a job; schedulers have their own."""
     rows = min(BLOCK, region.height)
     memory = _job_bytes(config)
@@ -60,12 +61,14 @@ def check_tiles(config: Config, region: Window) -> None:
         check_strips(rows, region.width, config, memory, config.cluster.cores)
     if config.cluster.kind not in ("threads", "processes"):
         return
-    height, width = (min(config.tiles.size, side) for side in (region.height, region.width))
+    grid = Grid(region, config.tiles.size)
+    height, width = grid.tile(0, 0).core.height, grid.tile(0, 0).core.width
+    largest = max((narrowed(ranges, tile.core, config) for tile in grid), key=lambda one: one.disparity.count)
     most = config.cluster.workers or usable_cores()
-    tiles, strips = min(most, len(Grid(region, config.tiles.size))), min(most, -(-region.height // BLOCK))
+    tiles, strips = min(most, len(grid)), min(most, -(-region.height // BLOCK))
     check_memory(
-        tiles * volume_bytes(height, width, config),
-        f"tiles of {height} x {width} pixels x {config.disparity.count} disparities, {tiles} at once,",
+        tiles * volume_bytes(height, width, largest),
+        f"tiles of {height} x {width} pixels x {largest.disparity.count} disparities, {tiles} at once,",
         "choose a smaller --tile-size or fewer --workers",
     )
     check_memory(
@@ -75,10 +78,12 @@ def check_tiles(config: Config, region: Window) -> None:
     )
 
 
-def disk_bytes(grid: Grid, config: Config, images: Iterable[Image]) -> tuple[int, int, int]:
+def disk_bytes(
+    grid: Grid, config: Config, images: Iterable[Image], ranges: LocalRanges | None = None
+) -> tuple[int, int, int]:
     """Return the bytes of tiles and what they hand on, of parts of files, and of the files, at most."""
     region, files = grid.region, files_of_run(config)
     tiles = store_bytes(grid, has_coverage=config.has_coverage)
-    handed = handed_bytes(grid, config, images, keeps_pixels=not is_remote(config.cluster))
+    handed = handed_bytes(grid, config, () if is_remote(config.cluster) else images, ranges)
     size = region.height, region.width
     return tiles + handed, part_bytes(files, *size), file_bytes(files, *size)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
@@ -152,7 +152,8 @@ class Job:
 
     def _check_space(self) -> None:
         """Raise if disks have no room for what a run has yet to write."""
-        tiles, parts, final = disk_bytes(self.store.grid, self.config, self.images.values())
+        ranges, images = self.prepared.ranges, self.images.values()
+        tiles, parts, final = disk_bytes(self.store.grid, self.config, images, ranges)
         share = len(self.waiting()) / len(self.store.grid)
         before = share * tiles + max(0, self.has_files * parts - sum(self.store.folder.sizes(PARTS).values()))
         final *= self.has_files
@@ -187,9 +188,11 @@ class Job:
         """Return where many images show the ground; None of a pair."""
         if self.prepared.ground or self.swept is None:
             return self.prepared.ground
-        if kept := _read_ground(self.store, self.swept.asked):
-            return kept[0]
-        raise DamagedTilesError(f"the geometry in {self.store.folder} is missing: rerun the same command: it resumes")
+        try:
+            return _read_ground(self.store, self.swept.asked)[0]
+        except DamagedFileError as error:
+            message = f"the geometry in {self.store.folder} is missing: rerun the same command: it resumes"
+            raise DamagedTilesError(message) from error
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what workers read from the store, see `ranges` and `ground`, and evidence."""
@@ -243,7 +246,7 @@ def job_of(
 ) -> Job:
     """Make the job of a prepared pair in a folder; its tiles are named by ``pair`` where several share a store."""
     config = fitted_to_jobs(prepared.config)
-    check_tiles(config, region)
+    check_tiles(config, region, prepared.ranges)
     prepared = replace(prepared, config=config)
     read = [*identities(inputs), *(files_of(config.disparity.grid) if config.disparity.grid else ())]
     manifest = _manifest(prepared, relative_in(out, inputs), region)
@@ -257,18 +260,16 @@ def job_of(
     return Job(prepared, kept, out, manifest, requested, overwrite, swept=swept)
 
 
-def _read_ground(store: Store, asked: str) -> tuple[GroundViews, dict[str, Any]] | None:
-    try:
-        with store.opened(ONCE, _GROUND, asked) as archive:
-            arrays = [archive[name].copy() for name in archive.names()]
-            return ground_of(archive.meta["figures"], arrays), dict(archive.meta["report"])
-    except DamagedFileError:
-        return None
+@lru_cache(1)  # of a large grid it is tens of MB
+def _read_ground(store: Store, asked: str) -> tuple[GroundViews, dict[str, Any]]:
+    with store.opened(ONCE, _GROUND, asked) as archive:
+        arrays = [archive[name].copy() for name in archive.names()]
+        return ground_of(archive.meta["figures"], arrays), dict(archive.meta["report"])
 
 
 def kept_ground(out: Path, asked: str) -> tuple[GroundViews, dict[str, Any]] | None:
     """Return what an earlier start of the same sweep in a folder has found, and what it noted of it; None without."""
-    with suppress(StoreError):
+    with suppress(StoreError, DamagedFileError):
         if manifest := read_manifest(home_of(out)):
             return _read_ground(Store(place_of(home_of(out), manifest), _NO_TILES, ""), asked)
     return None

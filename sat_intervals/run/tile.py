@@ -82,7 +82,7 @@ def _match_tile(
             if count is not None:
                 base = patch_areas(frame, job.config, ranges)[0].base
                 products["count"] = count[tile.core.relative_to(base).slices]
-    usable = {side: int((view.state == 0).sum()) for side, view in zip(job.images, views, strict=True)}
+    usable = {side: int((view.state == 0).sum()) for side, view in zip(job.images, views, strict=False)}
     if handed:
         handed[LAST][_place(tile)] = patch.leaving
     with timed(seconds, "write"):

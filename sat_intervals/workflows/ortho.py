@@ -7,7 +7,7 @@ from sat_intervals.heights.stack import median_of, ortho
 from sat_intervals.match.ground import GroundViews
 from sat_intervals.products import Band
 from sat_intervals.progress import Progress
-from sat_intervals.raster import File, OutputWriter, read_layers, read_views
+from sat_intervals.raster import File, OutputWriter, read_layers, read_reduced_views
 from sat_intervals.run.job import Job
 from sat_intervals.tiling import Window
 from sat_intervals.workflows.many import ORTHO
@@ -46,6 +46,6 @@ def _window(job: Job, ground: GroundViews, window: Window) -> np.ndarray:
         return heights
     disparity = (np.where(known, heights, np.median(heights[known])) - ground.base) / ground.step
     ends = int(np.floor(disparity.min())), int(np.ceil(disparity.max()))
-    views = ground.usable(read_views(job.images.values(), ground.windows(window, *ends)))
+    views = read_reduced_views(job.images.values(), ground.windows(window, *ends), ground.reductions)
     found = np.stack([ortho(ground, n, view, window, disparity)[0] for n, view in enumerate(views)])
     return np.where(known, median_of(found), np.float32(np.nan)).astype(np.float32)

@@ -23,7 +23,7 @@ from sat_intervals.match.patch import PatchFrame, match_patch, patch_areas
 from sat_intervals.match.postprocess import RawRows
 from sat_intervals.match.sweep import SweepCost
 from sat_intervals.match.whole import scale_of_rows
-from sat_intervals.raster import Projection, open_image, read_layers, read_place, read_views
+from sat_intervals.raster import Projection, open_image, read_layers, read_place, read_reduced_views
 from sat_intervals.tiling import Window
 from sat_intervals.workflows.calibrate import write_calibration
 from sat_intervals.workflows.demo import CRS, write_views
@@ -85,7 +85,7 @@ def measured(
     config, ground = plan.config, plan.ground
     frame = PatchFrame.of_whole(Window(0, 0, *ground.shape))
     cost, areas = SweepCost(config, Given(ground=ground, ranges=plan.ranges)), patch_areas(frame, config, plan.ranges)
-    costs = cost.of_areas(read_views(tuple(images), cost.windows(areas)), areas)
+    costs = cost.of_areas(read_reduced_views(images, cost.windows(areas), ground.reductions), areas)
     thresholds = threshold_sweep(config)
     gauge, true = Gauge(thresholds, name, 0.0, in_blocks=False), None
     for pair in pairs_of(thresholds):

@@ -8,7 +8,8 @@ import numpy as np
 import rasterio
 
 from sat_intervals import match_arrays
-from sat_intervals.match.coarse import Found, find_range, finest_step, reduced
+from sat_intervals.kernels.resampling import reduced
+from sat_intervals.match.coarse import Found, find_range, finest_step
 from sat_intervals.match.local_ranges import LocalRanges
 
 DATA = Path(os.environ.get("SAT_INTERVALS_SHARED", "../shared")) / "data"

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from sat_intervals.kernels.resampling import reach, resample, resample_reduced
+from sat_intervals.kernels.resampling import Step, reach, reduced, resample, resample_reduced
 
 STEP = 4
 
@@ -78,3 +78,10 @@ def test_resample_reduced__leaves_no_pattern_of_finer_detail():
     nodes = turned((16, 16), (20.0, 20.0), 0.0, 1.9)
     assert np.ptp(resample(stripes, (0, 0), nodes, STEP, (0, 0), 16, 16)) > 0.9
     assert np.ptp(resample_reduced(stripes, (0, 0), nodes, STEP, (0, 0), 16, 16, 1.9)) < 0.1
+
+
+def test_reduced__averages_usable_pixels_where_half_of_a_block_is_usable():
+    pixels = np.array([[1, 2, 0, 8, 9], [3, 0, 0, 0, 9]], np.float32)
+    assert reduced(pixels, (pixels == 0).view(np.uint8), Step(2, 2)).tolist()[0][0] == 2.0
+    assert np.isnan(reduced(pixels, (pixels == 0).view(np.uint8), Step(2, 2))[0, 1])
+    assert reduced(pixels, np.zeros(pixels.shape, np.uint8), Step(1, 2)).tolist() == [[1.5, 4.0], [1.5, 0.0]]

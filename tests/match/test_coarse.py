@@ -5,13 +5,12 @@ import pytest
 
 from sat_intervals import load_config, match_arrays
 from sat_intervals.demo import make_scene
+from sat_intervals.kernels.resampling import Step, reduced
 from sat_intervals.match.coarse import (
     Found,
     NoRangeError,
-    Step,
     find_range,
     finest_step,
-    reduced,
     undeclared_border,
     with_range,
 )
@@ -68,13 +67,6 @@ def test_find_range__few_rows_are_averaged_less():
     assert finest_step(12, 3000) == Step(1, 8)
     assert finest_step(3000, 500) == Step(1, 1)
     assert finest_step(3000, 1900) == Step(4, 4)
-
-
-def test_reduced__averages_usable_pixels_where_half_of_a_block_is_usable():
-    pixels = np.array([[1, 2, 0, 8, 9], [3, 0, 0, 0, 9]], np.float32)
-    assert reduced(pixels, (pixels == 0).view(np.uint8), Step(2, 2)).tolist()[0][0] == 2.0
-    assert np.isnan(reduced(pixels, (pixels == 0).view(np.uint8), Step(2, 2))[0, 1])
-    assert reduced(pixels, np.zeros(pixels.shape, np.uint8), Step(1, 2)).tolist() == [[1.5, 4.0], [1.5, 0.0]]
 
 
 def test_undeclared_border__reaches_the_border():

@@ -18,7 +18,7 @@ def made(ranges=None, hidden=()):
     seen = []
     for n, window in enumerate(cost.windows([area])):
         pixels = np.random.default_rng(n).uniform(1, 1000, (window.height, window.width)).astype(np.float32)
-        seen.append(View(window, pixels, np.full(pixels.shape, NO_DATA if n in hidden else 0, np.uint8)))
+        seen.append(View(window, np.where(n in hidden, np.float32(np.nan), pixels), np.zeros(pixels.shape, np.uint8)))
     return cost.of_areas(seen, [area])[0]
 
 
