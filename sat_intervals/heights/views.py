@@ -9,16 +9,19 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.ground import read_with_ground
-from sat_intervals.heights.lattice import Extent
+from sat_intervals.heights.lattice import Extent, joined
 from sat_intervals.heights.models import SensorImage
 from sat_intervals.heights.point_cloud import Cells
-from sat_intervals.match.ground import BLOCK, GroundViews
+from sat_intervals.match.ground import BLOCK, FEWEST, GroundViews
 from sat_intervals.raster import Image, Projection, acquired, between_180, find_model
+from sat_intervals.tiling import Window
 
-# Nodes along an image and a grid at which a footprint is looked for, and heights.
-_SIDE, _NODES, _LEVELS = 9, 65, 9
+# Nodes along an image at which other images are looked for, and heights.
+_NODES, _LEVELS = 33, 9
 # Metres between heights at which positions are known, at most, and their number.
 _SPACING, _MOST = 50.0, 33
+# Base-to-height ratio below which heights do not show.
+_FLAT = 0.01
 # Base-to-height ratios of pairs, and the best one; days between dates that count as much as a ratio of 1, and the days
 # of a year, after which the light is the same.
 _RATIOS, _BEST, _DAYS, _YEAR = (0.2, 1.0), 0.4, 150.0, 365
@@ -79,45 +82,67 @@ def views_of(
     )
 
 
+def middle_of(images: Sequence[SensorImage]) -> tuple[float, float]:
+    """Return longitude and latitude of the middle of all models."""
+    x, y = np.array([(one.model.offset_x, one.model.offset_y) for one in images]).T
+    return float(np.mean(x[0] + between_180(x - x[0]))), float(np.mean(y))
+
+
+def undulation_at(images: Sequence[SensorImage], projection: Projection) -> float:
+    """Return the height of the geoid above the ellipsoid in the middle of all models, metres; 0 without a geoid."""
+    return float(projection.undulation(*np.array(middle_of(images))[:, np.newaxis])[0])
+
+
 def common_cells(
-    images: Sequence[SensorImage], projection: Projection, heights: tuple[float, float], resolution: float
+    images: Sequence[SensorImage],
+    projection: Projection,
+    heights: tuple[float, float],
+    resolution: float,
+    grid: Cells | None = None,
 ) -> Cells:
-    """Return the cells that at least two images see at one of a range of heights; raise without any."""
-    levels = np.linspace(*heights, _LEVELS)
-    box = _footprint(images, projection, heights)
-    x, y = np.meshgrid(np.linspace(box.left, box.right, _NODES), np.linspace(box.top, box.bottom, _NODES))
-    sizes = np.array([(one.image.height, one.image.width) for one in images])[:, None, None, :]
-    seen = np.zeros((len(images), *x.shape), bool)
-    shared = np.zeros(x.shape, bool)
-    for height in levels:
-        places = positions(images, projection, x, y, height)
-        inside = ((places >= -0.5) & (places <= sizes - 0.5)).all(axis=-1)
-        common = inside.sum(axis=0) >= 2
-        shared, seen = shared | common, seen | (inside & common)
-    if not shared.any():
+    """Return the cells, or blocks of a grid, that two images see at one of a range of heights; raise without any."""
+    seen, extents, up = np.zeros(len(images), bool), list[Extent](), undulation_at(images, projection)
+    sizes = np.array([(one.image.height, one.image.width) for one in images])[:, np.newaxis]
+    for n, one in enumerate(images):  # nodes of each: those of a large image may miss a small one
+        ends = zip(one.origin, sizes[n, 0], strict=True)
+        nodes = np.meshgrid(*(first + np.linspace(0, size, _NODES) for first, size in ends))
+        row, column = (axis.ravel() for axis in nodes)
+        for height in np.linspace(*heights, _LEVELS):
+            points = one.model.direct_loc_h(row, column, np.full(row.size, height + up))
+            ground = np.stack(projection.place(points[:, 0], points[:, 1]))
+            places = positions(images, projection, ground[0], ground[1], height)
+            inside = np.all((places >= -0.5) & (places <= sizes - 0.5), axis=-1)
+            inside[n] = True
+            common = inside.sum(axis=0) >= FEWEST
+            seen |= (inside & common).any(axis=1)
+            if common.any():
+                least, most, shared = ground.min(axis=1), ground.max(axis=1), ground[:, common]
+                more = (most - least) / (_NODES - 1)
+                low, high = np.maximum(least, shared.min(axis=1) - more), np.minimum(most, shared.max(axis=1) + more)
+                extents.append(Extent(*map(float, (*low, *high))))
+    extent = joined(extents)
+    if extent is None:
         raise SatIntervalsError("no two images see the same ground: give images of one place")
-    for one, places in zip(images, seen, strict=True):
-        if not places.any():
-            raise SatIntervalsError(f"{one.image.path} sees no ground that another image sees: leave it out")
-    across, down = (box.right - box.left) / (_NODES - 1), (box.top - box.bottom) / (_NODES - 1)
-    extent = Extent(x[shared].min() - across, y[shared].min() - down, x[shared].max() + across, y[shared].max() + down)
-    return Cells.over(extent, resolution)
+    if not seen.all():
+        strange = images[int(seen.argmin())].image.path
+        raise SatIntervalsError(f"{strange} sees no ground that another image sees: leave it out")
+    return _blocks_over(extent, grid) if grid else Cells.over(extent, resolution)
 
 
-def _footprint(images: Sequence[SensorImage], projection: Projection, heights: tuple[float, float]) -> Extent:
-    corners = []
-    for one in images:
-        rows, columns = (
-            first + np.linspace(0, size, _SIDE)
-            for first, size in zip(one.origin, (one.image.height, one.image.width), strict=True)
+def _blocks_over(extent: Extent, grid: Cells) -> Cells:
+    """Return the cells of a grid in whole blocks that cover an extent; raise without any."""
+    side = BLOCK * grid.resolution
+    first = (grid.top - extent.top) / side, (extent.left - grid.left) / side
+    last = (grid.top - extent.bottom) / side, (extent.right - grid.left) / side
+    blocks = Window.around(first, last).clipped(Window(0, 0, -(-grid.rows // BLOCK), -(-grid.columns // BLOCK)))
+    if not (blocks.height and blocks.width):
+        raise SatIntervalsError(
+            "on the grid that is given no two images see the same ground: give a grid of this place"
         )
-        row, column = (axis.ravel() for axis in np.meshgrid(rows, columns, indexing="ij"))
-        for height in heights:
-            up = projection.undulation(np.array([one.model.offset_x]), np.array([one.model.offset_y]))
-            points = one.model.direct_loc_h(row, column, np.full(row.size, height + float(up[0])))
-            corners.append(np.stack(projection.place(points[:, 0], points[:, 1])))
-    x, y = np.concatenate(corners, axis=1)
-    return Extent(float(x.min()), float(y.min()), float(x.max()), float(y.max()))
+    left, top = grid.left + side * blocks.column, grid.top - side * blocks.row
+    rows = min(grid.rows, BLOCK * blocks.row_stop) - BLOCK * blocks.row
+    columns = min(grid.columns, BLOCK * blocks.column_stop) - BLOCK * blocks.column
+    return Cells(left, top, grid.resolution, rows, columns)
 
 
 def towards(ground: GroundViews, resolution: float) -> np.ndarray:
@@ -141,7 +166,12 @@ def with_pairs(ground: GroundViews, paths: Sequence[str], resolution: float, cou
     views, dates = towards(ground, resolution), [acquired(path) for path in paths]
     every = list(combinations(range(len(paths)), 2))
     ratios = {pair: float(np.linalg.norm(views[pair[0]] - views[pair[1]])) for pair in every}
-    least = min(_RATIOS[0], max(ratios.values()) / 2)
+    if (widest := max(ratios.values())) < _FLAT:
+        raise SatIntervalsError(
+            f"{', '.join(paths)} show the ground from one direction, with base-to-height ratios up to {widest:.3f}: "
+            "give images from other directions, and to each its own RPC model"
+        )
+    least = min(_RATIOS[0], widest / 2)
     ranked = []
     for pair in every:
         one, other = (dates[n] for n in pair)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -18,8 +19,8 @@ from sat_intervals.heights.stack import (
     samples_of,
     surface_of,
 )
-from sat_intervals.heights.views import common_cells, views_of, with_pairs
-from sat_intervals.match.ground import GroundViews
+from sat_intervals.heights.views import common_cells, undulation_at, views_of, with_pairs
+from sat_intervals.match.ground import BLOCK, GroundViews
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.prepare.pair import Each
 from sat_intervals.raster import Projection
@@ -115,15 +116,18 @@ def found_ground(
 
     Images that are not like the others on the surface, such as clouds or another place, are left out.
     """
+    up = undulation_at(sensors, projection)
+    for one, height in product(sensors, heights or ()):
+        one.check_height(height + up)
     search, left_out = _Search(sensors, projection, config, each), list[SensorImage]()
     while True:
-        domain = heights or _domain(search.sensors, projection)
-        cells = grid or common_cells(search.sensors, projection, domain, resolution)
+        domain = heights or _domain(search.sensors, up)
+        cells = common_cells(search.sensors, projection, domain, resolution, grid)
         found = heights
         if found is None:
             top = search.stack(cells, [*_factors(cells), 1][0], domain)
             found = _heights_of(surface_of(top, each), top, domain)
-            cells = grid or common_cells(search.sensors, projection, found, resolution)
+            cells = common_cells(search.sensors, projection, found, resolution, grid)
         stack = search.descend(cells, found)
         unlike = search.alike < _UNLIKE * np.nanmedian(search.alike)  # not those that show too few of the samples
         if not unlike.any():
@@ -137,16 +141,33 @@ def found_ground(
             )
         search = _Search(kept, projection, config, each)
     config = config.model_copy(update={"disparity": stack.config.disparity})
-    return GroundPlan(search.sensors, left_out, cells, stack.ground, config, stack.ranges, search.shifts, search.alike)
+    stack = _on_grid(stack, cells, grid) if grid else stack
+    cells, shifts, alike = grid or cells, search.shifts, search.alike
+    return GroundPlan(search.sensors, left_out, cells, stack.ground, config, stack.ranges, shifts, alike)
 
 
-def _domain(sensors: Sequence[SensorImage], projection: Projection) -> tuple[float, float]:
+def _on_grid(stack: Stack, cells: Cells, grid: Cells) -> Stack:
+    """Return the stack of some blocks of a grid as that of all; the others, which nobody sees, have one height."""
+    side, shape = BLOCK * grid.resolution, (grid.rows, grid.columns)
+    first = round((grid.top - cells.top) / side), round((cells.left - grid.left) / side)
+    inner = [-(-size // BLOCK) for size in stack.ground.shape]
+    around = [(one, -(-whole // BLOCK) - one - size) for one, whole, size in zip(first, shape, inner, strict=True)]
+    search, ranges = stack.config.disparity, stack.ranges
+    ends = (
+        (ranges.minimum, ranges.maximum)
+        if ranges
+        else (np.full(inner, end) for end in (search.minimum, search.maximum))
+    )
+    least, most = (np.pad(end, around).astype(np.int16) for end in ends)
+    ground = replace(stack.ground, first=first, shape=shape)
+    return replace(stack, ground=ground, ranges=LocalRanges(least, most, BLOCK, BLOCK))
+
+
+def _domain(sensors: Sequence[SensorImage], up: float) -> tuple[float, float]:
     """Return the heights that all models have in common, above the geoid if there is one."""
     lowest, highest = (max(one.heights[0] for one in sensors), min(one.heights[1] for one in sensors))
     if lowest >= highest:
         raise SatIntervalsError("the models of the images have no heights in common: give heights")
-    middle = sensors[0].model
-    up = float(projection.undulation(np.array([middle.offset_x]), np.array([middle.offset_y]))[0])
     return lowest - up, highest - up
 
 

@@ -171,14 +171,14 @@ def sweep_job(asked: Asked, out: Path, each: Each, *, overwrite: bool = False, p
 
 def found_geometry(asked: Asked, each: Each) -> Geometry:
     """Find the geometry of a sweep."""
-    from sat_intervals.heights.views import sensors_of
+    from sat_intervals.heights.views import middle_of, sensors_of
     from sat_intervals.workflows.ground import found_ground
 
     images, wanted = list(asked.images.values()), asked.wanted
     sensors = sensors_of(images, wanted.models)
-    middle = sensors[0].model
-    projection = Projection(wanted.crs or utm_of(middle.offset_x, middle.offset_y), wanted.geoid)
-    projection.check(middle.offset_x, middle.offset_y)
+    middle = middle_of(sensors)
+    projection = Projection(wanted.crs or utm_of(*middle), wanted.geoid)
+    projection.check(*middle)
     plan = found_ground(sensors, projection, asked.cell, asked.config, each, wanted.heights, asked.grid)
     search = plan.config.disparity
     ends = [plan.ground.base + plan.ground.step * end for end in (search.minimum, search.maximum)]
