@@ -118,7 +118,7 @@ def reduced(pixels: np.ndarray, state: np.ndarray, step: Step) -> np.ndarray:
     pixels, state: ``(rows, columns)``; unusable pixels are 0. Rows and columns that fill no block are dropped.
     Returns float32, NaN where less than half of a block is usable.
     """
-    sums, counts = pixels, (state == 0).view(np.uint8)
+    sums, counts = pixels, (state == 0).astype(np.min_scalar_type(step.rows * step.columns))
     with np.errstate(over="ignore"):  # undeclared no data may be as large as a float32 can be
         for axis, size in enumerate(step):
             sums, counts = _added(sums, axis, size), _added(counts, axis, size)
