@@ -3,6 +3,7 @@
 from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,12 +12,13 @@ from sweeps import COLUMNS, ROWS
 from sat_intervals.demo import DATUM, PIXEL
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.point_cloud import Cells
+from sat_intervals.match.ground import BLOCK
 from sat_intervals.raster import Projection, open_image
 from sat_intervals.tiling import Window
 from sat_intervals.workflows import demo
 
 with suppress(SatIntervalsError):  # without shareloc all tests here are skipped
-    from sat_intervals.heights.views import common_cells, sensors_of, towards, views_of, with_pairs
+    from sat_intervals.heights.views import common_cells, middle_of, sensors_of, towards, views_of, with_pairs
 
 pytestmark = pytest.mark.peer("shareloc")
 
@@ -67,6 +69,29 @@ def test_common_cells__hold_what_two_images_see_and_refuse_other_places_by_name(
         common_cells([*sensors, strange[1]], Projection(demo.CRS), HEIGHTS, PIXEL)
     with pytest.raises(SatIntervalsError, match="no two images see the same ground: give images of one place"):
         common_cells([sensors[0], strange[0]], Projection(demo.CRS), HEIGHTS, PIXEL)
+
+
+def test_common_cells__are_all_that_a_small_image_shows_of_a_large_one_and_blocks_of_a_grid_there(sensors):
+    large = replace(sensors[0], image=replace(sensors[0].image, height=40 * ROWS, width=40 * COLUMNS))
+    for images in ([large, sensors[1]], [sensors[1], large]):
+        found = common_cells(images, Projection(demo.CRS), HEIGHTS, PIXEL)
+        assert abs(found.top - demo.TOP) < 2
+        assert 0 <= found.rows - ROWS < 8
+        assert 0 <= found.columns - COLUMNS < 40
+    grid = Cells(found.left - 9990, found.top + 9990, PIXEL, 50_000, 50_000)
+    part = common_cells(sensors, Projection(demo.CRS), HEIGHTS, PIXEL, grid)
+    assert (grid.top - part.top) % (BLOCK * PIXEL) == (part.left - grid.left) % (BLOCK * PIXEL) == 0
+    assert found.top <= part.top < found.top + BLOCK * PIXEL
+    assert part.rows % BLOCK == part.columns % BLOCK == 0
+    assert part.rows < ROWS + 2 * BLOCK
+    with pytest.raises(SatIntervalsError, match="on the grid that is given no two images see the same ground"):
+        common_cells(sensors, Projection(demo.CRS), HEIGHTS, PIXEL, replace(grid, left=found.left + 9990))
+
+
+def test_middle_of__is_that_of_all_models_on_both_sides_of_180_degrees(sensors):
+    assert middle_of(sensors) == pytest.approx(middle_of(sensors[::-1]), abs=1e-9)
+    models = [SimpleNamespace(offset_x=x, offset_y=10.0) for x in (179.9, -179.8)]
+    assert middle_of([replace(sensors[0], model=model) for model in models]) == pytest.approx((180.05, 10))
 
 
 def test_with_pairs__every_image_has_one_and_ratios_are_those_of_the_views(sensors, images):

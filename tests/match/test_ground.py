@@ -74,6 +74,30 @@ def test_windows__contain_all_that_is_read():
         assert seen.all()
 
 
+def test_within__views_of_a_window_have_its_costs_and_no_others():
+    ground, inner = views(), Window(70, 70, 50, 60)
+    part = ground.within(inner)
+    assert part.places.shape[2:4] == (2, 3)
+    assert part.windows(inner, -6, 6) == ground.windows(inner, -6, 6)
+    assert list(part.blocks(Window(0, 0, *SHAPE))) == list(ground.blocks(Window(64, 64, 64, 116)))
+    assert part.windows(Window(0, 0, 64, 64), -6, 6) == (Window(0, 0, 0, 0),) * 3
+    images, disparities = image_views(ground, ground.windows(inner, -6, 6)), np.arange(-6.0, 7.0)
+    for block, there in part.blocks(inner):
+        costs, expected = (one.costs(images, block, there, disparities, CONFIG)[0] for one in (part, ground))
+        np.testing.assert_array_equal(costs, expected)
+    disparity = np.zeros((inner.height, inner.width))
+    np.testing.assert_allclose(part.positions(2, inner, disparity), ground.positions(2, inner, disparity), atol=1e-9)
+
+
+def test_shown__blocks_are_those_that_two_images_may_show():
+    ground = views()
+    assert ground.shown([(999, 999)] * 3).all()
+    found = ground.shown([(999, 999), (60, 90), (1, 1)])
+    assert found[0, 0]
+    assert not found[2].any()
+    assert not ground.within(Window(70, 70, 50, 60)).shown([(999, 999)] * 3)[0].any()
+
+
 @pytest.mark.parametrize("part", [Window(10, 21, 30, 25), Window(0, 0, 1, 64), Window(63, 63, 1, 1)])
 def test_costs__of_a_part_are_those_of_the_whole_block(part):
     ground, disparities = views(), np.arange(-6.0, 7.0)

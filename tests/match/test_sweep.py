@@ -34,6 +34,17 @@ def test_of_areas__candidates_outside_the_range_of_a_block_get_the_largest_cost(
     np.testing.assert_array_equal(narrow[rest][:, :COUNT], whole[rest][:, :COUNT])
 
 
+def test_of_areas__cells_of_blocks_without_places_are_no_data():
+    ground = views().within(Window(128, 128, 1, 1))
+    cost, area = SweepCost(CONFIG, Given(ground=ground)), Area.of(WINDOW, CONFIG)
+    nothing = tuple(View(window, *np.zeros((2, 0, 0))) for window in cost.windows([area]))
+    found = cost.of_areas(nothing, [area])[0]
+    assert (found.state == NO_DATA).all()
+    assert (found.costs.left == CONFIG.numbers.largest).all()
+    again = cost.of_areas((), [area], [found.costs.left, found.seen])[0]
+    np.testing.assert_array_equal(again.state, found.state)
+
+
 def test_of_areas__cells_that_fewer_than_two_images_see_are_no_data():
     three, two, one = made(), made(hidden=[1]), made(hidden=[0, 1])
     assert (three.seen == 3).all()

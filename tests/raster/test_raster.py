@@ -22,11 +22,12 @@ from rasterio.rpc import RPC
 from rasterio.transform import Affine
 
 from sat_intervals.errors import InputError
+from sat_intervals.kernels.resampling import Step, reduced
 from sat_intervals.products import BANDS, FLAGS, INVALID, MASKED, NO_DATA
 from sat_intervals.raster import RUN_FILES, File, Georeferencing, Image, OutputError, OutputWriter, gdal, points_file
 from sat_intervals.raster.images import check_pair, open_image
 from sat_intervals.raster.projection import utm_of
-from sat_intervals.raster.windows import kept_view, read_window, restored_view
+from sat_intervals.raster.windows import kept_view, read_reduced, read_window, restored_view
 from sat_intervals.tiling import View, Window
 
 UTM = {"crs": "EPSG:32631", "transform": Affine(0.5, 0, 360000.1, 0, -0.5, 4800000.3)}
@@ -227,6 +228,16 @@ def test_read_window__is_the_same_window_of_a_padded_image(tmp_path, row, column
     padded = np.pad(RAMP + 1, 30)[row + 30 : row + 30 + height, column + 30 : column + 30 + width]
     np.testing.assert_array_equal(pixels, padded)
     np.testing.assert_array_equal(state, np.where(padded == 0, NO_DATA, 0))
+
+
+@pytest.mark.parametrize("window", [Window(0, 0, 64, 96), Window(-9, -12, 45, 60), Window(30, -90, 12, 78)])
+def test_read_reduced__is_the_reduced_window_whatever_is_read_at_once(tmp_path, monkeypatch, window):
+    pixels = np.random.default_rng(0).integers(0, 9, (50, 70), np.uint16)
+    image, step = open_image(make(tmp_path / "a.tif", pixels, nodata=0)), Step(3, 2)
+    expected = reduced(*read_window(image, window), step)
+    for pixels in (1, 500, 10**6):
+        monkeypatch.setattr("sat_intervals.raster.windows._STRIP", pixels)
+        np.testing.assert_array_equal(read_reduced(image, window, step), expected)
 
 
 @pytest.mark.parametrize(

@@ -10,13 +10,13 @@ import pytest
 import rasterio
 from helpers import COMMAND, invoke, refused, wait_until
 from raw import raw_pair
-from sweeps import OPTIONS, WORDS
+from sweeps import CRS, OPTIONS, WORDS
 
 from sat_intervals import SatIntervalsError, surface
 from sat_intervals.demo import PIXEL, make_scene
+from sat_intervals.match.ground import BLOCK
 from sat_intervals.products import SURFACE
-from sat_intervals.raster import Georeferencing, read_layers, write_layer
-from sat_intervals.workflows.demo import CRS
+from sat_intervals.raster import Georeferencing, north_up, read_layers, write_layer
 
 pytestmark = pytest.mark.peer("shareloc")
 
@@ -56,7 +56,7 @@ def test_surface_of_many__bands_are_those_of_every_surface(sweep):
 
 
 def test_surface_of_many__has_the_same_bytes_for_any_tiles_and_says_that_it_was_complete(sweep, tmp_path, caplog):
-    out, settings = tmp_path / "out", {"preset": "many", "tiles": {"size": 64}}
+    out, settings = tmp_path / "out", {"tiles": {"size": 64}}  # of the preset many
     report = surface(sweep.images, out, settings, **OPTIONS, keep_tiles=True)
     assert (out / "tiles" / "tiles").is_dir()
     assert files_of(out) == files_of(sweep.out)
@@ -68,6 +68,24 @@ def test_surface_of_many__has_the_same_bytes_for_any_tiles_and_says_that_it_was_
     (out / "dsm.tif").unlink()
     with pytest.raises(SatIntervalsError, match=r"dsm.tif"):
         surface(sweep.images, out, settings, **OPTIONS)
+
+
+def test_surface_of_many__finds_the_heights_on_a_part_of_a_large_grid(sweep, tmp_path):
+    cells, around = sweep.report["sweep"]["cells"], 8 * BLOCK
+    place = north_up(CRS, cells["left"] - around * PIXEL, cells["top"] + around * PIXEL, PIXEL)
+    grid, size = tmp_path / "grid.tif", 2 * around
+    write_layer(grid, np.zeros((size, size), np.uint8), 255, place)
+    report = surface(sweep.images, tmp_path / "out", resolution=grid)
+    expected = read_layers(sweep.out / "dsm.tif")
+    found = read_layers(tmp_path / "out" / "dsm.tif")
+    assert found.shape == (6, size, size)
+    assert report["sweep"]["heights"] == pytest.approx(sweep.report["sweep"]["heights"], abs=1)
+    inside = np.s_[:, around : around + cells["rows"], around : around + cells["columns"]]
+    away = np.abs(found[inside][0] - expected[0])
+    assert np.nanmedian(away) < 0.05
+    assert np.isfinite(away).sum() > 0.9 * np.isfinite(expected[0]).sum()
+    found[inside] = np.nan
+    assert np.isnan(found).all()
 
 
 @pytest.mark.process
@@ -113,6 +131,11 @@ def test_surface_of_many__refuses_what_it_cannot_use(sweep, tmp_path):
     )
     refused(("surface", *sweep.images, sweep.images[0], out, *WORDS), f"{sweep.images[0]} is given twice")
     refused(("surface", *sweep.images, out, *WORDS, "--heights", 50, 0), "heights are 50 to 0 m: give the lowest one")
+    refused(
+        ("surface", *sweep.images, out, *WORDS, "--heights", 0, 9000), "height 9000 m: ", "give a height in this range"
+    )
+    same = [shutil.copy(sweep.images[0], tmp_path / f"same_{n}.tif") for n in range(3)]
+    refused(("surface", *same, out, *WORDS), "show the ground from one direction", "give images from other directions")
     refused(("surface", *sweep.images, sweep.out, *WORDS, "--tile-size", 64), "--overwrite")
     assert not out.exists() or not list(out.glob("*.tif"))
 
