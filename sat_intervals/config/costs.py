@@ -240,7 +240,6 @@ class Sweep(_Cost):
 
     window: ClassVar = 5
     precomputed = 1
-    converted = 1
     has_right_view = False
     compares_two = False
 
