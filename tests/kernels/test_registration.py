@@ -5,9 +5,15 @@ import pytest
 from numpy.lib.stride_tricks import sliding_window_view
 
 from sat_intervals.kernels import registration
-from sat_intervals.kernels.registration import LEAST, REACH, Blocks, register, summary
+from sat_intervals.kernels.registration import LEAST, Blocks, register, summary
 
-CELL, SIDE = 0.5, 64
+CELL, SIDE, REACH = 0.5, 64, registration.REACH
+
+
+@pytest.fixture(autouse=True)
+def near(monkeypatch):
+    """Shifts of most tests are near: the search over the whole reach takes eight times as long."""
+    monkeypatch.setattr(registration, "REACH", 16)
 
 
 def hills(x, y):
@@ -41,7 +47,8 @@ def houses(x, y):
 def blocks_of(heights_at, shift, moves=1, noise=0.0, count=500, number=9, seed=0, aligned=False, wide=1):
     """Blocks of surfaces and points, anywhere or at centres of cells; noise of the surfaces is as wide as cells."""
     random = np.random.default_rng(seed)
-    size = SIDE + 2 * REACH
+    reach = registration.REACH
+    size = SIDE + 2 * reach
     column, row = np.meshgrid(np.arange(size), np.arange(size))
     surfaces, parts = [], []
     for index in range(number):
@@ -49,7 +56,7 @@ def blocks_of(heights_at, shift, moves=1, noise=0.0, count=500, number=9, seed=0
         surface = heights_at(left + column * CELL, top - row * CELL)
         added = sliding_window_view(random.normal(size=(size + wide - 1,) * 2), (wide, wide)).mean(axis=(2, 3))
         surfaces.append(surface + noise * added / added.std())
-        x, y = random.uniform(REACH, REACH + SIDE, (2, count))
+        x, y = random.uniform(reach, reach + SIDE, (2, count))
         if aligned:
             x, y = np.rint(x), np.rint(y)
         east, north = left + x * CELL - moves * shift[0], top - y * CELL - moves * shift[1]
@@ -59,11 +66,19 @@ def blocks_of(heights_at, shift, moves=1, noise=0.0, count=500, number=9, seed=0
     return Blocks(np.array(surfaces, np.float32), CELL, block, x, y, height, moves)
 
 
-@pytest.mark.parametrize(("heights_at", "within", "moves"), [(hills, 0.05, 1), (hills, 0.05, -1), (town, 0.25, 1)])
-def test_register__finds_a_shift(heights_at, within, moves):
-    found = register(blocks_of(heights_at, (3.0, -2.0, 5.0), moves))
+@pytest.mark.parametrize(
+    ("heights_at", "within", "moves", "reach", "shift"),
+    [
+        (hills, 0.05, -1, 16, (3, -2, 5)),
+        (hills, 0.05, 1, REACH, (20, -21, 5)),
+        (town, 0.25, 1, REACH, (3, -2, 5)),
+    ],
+)
+def test_register__finds_a_shift(monkeypatch, heights_at, within, moves, reach, shift):
+    monkeypatch.setattr(registration, "REACH", reach)
+    found = register(blocks_of(heights_at, shift, moves))
     assert found.is_horizontal
-    np.testing.assert_allclose(found.shift, (3, -2, 5), atol=within)
+    np.testing.assert_allclose(found.shift, shift, atol=within)
     assert np.median(found.after) == pytest.approx(0, abs=0.01)
     assert np.std(found.after) < np.std(found.before)
 
@@ -143,7 +158,7 @@ def test_register__refuses_the_horizontal_part_on_a_plane(noise, wide):
 
 
 def test_register__refuses_a_shift_beyond_its_reach():
-    found = register(blocks_of(hills, (0.98 * REACH * CELL, 0.0, 0.0)))
+    found = register(blocks_of(hills, (0.98 * registration.REACH * CELL, 0.0, 0.0)))
     assert not found.is_horizontal
 
 

@@ -18,6 +18,12 @@ def scene():
     return make_scene(260, 330, seed=17)
 
 
+@pytest.fixture(scope="module")
+def other():
+    """Another place."""
+    return make_scene(260, 330, seed=8)
+
+
 def lows(scene, folder, side):
     """A side of the pair whose smallest value is that of its undeclared_border."""
     pixels = getattr(scene, side).astype(np.uint16) + 2000
@@ -98,12 +104,11 @@ def test_warnings_of__isolated_pixels_without_data(scene, tmp_path):
     assert "of the pixels are no data or masked, but spoil the windows of" in report["warnings"][0]
 
 
-def test_warnings_of__images_that_have_little_in_common(scene, tmp_path):
+def test_warnings_of__images_that_have_little_in_common(scene, other, tmp_path):
     """As of dates before and after a change: cross-checking keeps most of it, with intervals as wide as the range."""
-    other = make_scene(260, 330, seed=8).left[:, : scene.right.shape[1]]
     for own, count in ((0.7, 0), (0.25, 1)):
         images = [tmp_path / f"{side}{count}.tif" for side in ("left", "right")]
-        for image, pixels in zip(images, (scene.left, own * scene.right + (1 - own) * other), strict=True):
+        for image, pixels in zip(images, (scene.left, own * scene.right + (1 - own) * other.left), strict=True):
             write_layer(image, pixels.astype(np.uint16), 0, PLACE)
         settings = {"disparity": {"minimum": scene.minimum, "maximum": scene.maximum}, "rows": "none"}
         report = match_pair(*images, tmp_path / str(count), settings)
@@ -111,10 +116,9 @@ def test_warnings_of__images_that_have_little_in_common(scene, tmp_path):
         assert ["the median interval is" in line for line in report["warnings"]] == [True] * count
 
 
-@pytest.mark.parametrize("search", [(-180, -110), (90, 150), (-120, -60), (40, 80)])
-def test_match__a_range_beside_the_truth_is_the_one_diagnosis(tmp_path, search):
+@pytest.mark.parametrize("search", [(-180, -110), (40, 80)])
+def test_match__a_range_beside_the_truth_is_the_one_diagnosis(scene, tmp_path, search):
     """Rows are wrong, too, but the range is named, and the one to give."""
-    scene = make_scene(300, 460, seed=4)
     write_pair(tmp_path, scene)
     images = tmp_path / "left.tif", tmp_path / "right.tif"
     for rows, status in (("auto", 2), ("none", 0)):
@@ -131,9 +135,8 @@ def test_match__a_range_beside_the_truth_is_the_one_diagnosis(tmp_path, search):
         match_arrays(left, right, {"disparity": {"minimum": search[0], "maximum": search[1]}})
 
 
-def test_prepare__refuses_an_unrelated_image(tmp_path):
-    for side, seed in (("left", 1), ("right", 2)):
-        pixels = getattr(make_scene(300, 420, seed=seed), side)
+def test_prepare__refuses_an_unrelated_image(scene, other, tmp_path):
+    for side, pixels in (("left", scene.left), ("right", other.right)):
         write_layer(tmp_path / f"{side}.tif", pixels, 0, PLACE)
     search = {"disparity": {"minimum": -30, "maximum": 40}}
     with pytest.raises(SatIntervalsError, match="check that both images show the same place"):

@@ -16,7 +16,9 @@ from sat_intervals.config.calibration import COVERAGES
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import ChangedInputError
 from sat_intervals.evaluate.disparity import evaluate_run
+from sat_intervals.match.gauge import pairs_of
 from sat_intervals.raster import write_layer
+from sat_intervals.run import measure
 from sat_intervals.run.calibrate import check_scenes
 from sat_intervals.run.job import open_job
 from sat_intervals.run.measure import CalibrationScene, measure_scenes, truth_of
@@ -82,8 +84,10 @@ def test_calibrate__workers_do_not_change_a_byte(scene, tmp_path):
 
 
 def test_calibrate__a_finished_run_equals_its_pair(scene, tmp_path):
-    """The run is matched again from its images, with its own settings."""
-    match_pair(scene / "left.tif", scene / "right.tif", tmp_path / "run", settings_with(scene, alpha=0.7))
+    """The run is matched again from its images, with its own settings, but over its whole search range."""
+    settings = settings_with(scene, alpha=0.7)
+    settings["disparity"]["local"] = True
+    match_pair(scene / "left.tif", scene / "right.tif", tmp_path / "run", settings)
     found = yaml.safe_load(calibrated(tmp_path / "run", tmp_path / "one.yaml"))
     expected = yaml.safe_load((scene / "calibration.yaml").read_text())
     assert (found["name"], expected["name"]) == ("one", "calibration")
@@ -157,6 +161,13 @@ def test_calibrate__mistaken_arguments_are_one_line(scene, tmp_path):
     assert not (tmp_path / "new.yaml").exists()
 
 
+@pytest.fixture
+def few(monkeypatch):
+    """Two levels of the sweep."""
+    monkeypatch.setattr(measure, "pairs_of", lambda thresholds: pairs_of(thresholds)[:1])
+
+
+@pytest.mark.usefixtures("few")
 def test_measure_scenes__deletes_the_tiles_of_a_killed_calibration(scene, tmp_path):
     scenes = scenes_of([scene], (), Choices())
     left = tmp_path / "left"
@@ -172,6 +183,7 @@ def test_measure_scenes__deletes_the_tiles_of_a_killed_calibration(scene, tmp_pa
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.usefixtures("few")
 def test_measure_scenes__ends_where_an_image_changes(scene, tmp_path):
     pair = copytree(scene, tmp_path / "pair")
     scenes = scenes_of([pair], (), Choices())
@@ -190,14 +202,6 @@ def off(folder):
     file = folder / "off.yaml"
     file.write_text("regularization: null\n")
     return file
-
-
-def test_calibrate__a_run_with_local_ranges_is_matched_over_its_whole_range(scene, tmp_path):
-    settings = settings_with(scene)
-    settings["disparity"]["local"] = True
-    match_pair(scene / "left.tif", scene / "right.tif", tmp_path / "out", settings)
-    found = yaml.safe_load(calibrated(tmp_path / "out", tmp_path / "one.yaml"))
-    assert found["levels"] == yaml.safe_load((scene / "calibration.yaml").read_text())["levels"]
 
 
 def test_check_scenes__needs_the_search_range_as_numbers(scene):
@@ -252,13 +256,12 @@ def test_check_scenes__needs_another_group_to_judge_with(scene, tmp_path):
 
 
 @pytest.mark.parametrize("tolerance", [0, 0.5])
-def test_calibrate__warns_of_a_truth_in_whole_pixels(scene, tmp_path, tolerance):
+def test_check_scenes__warns_of_a_truth_in_whole_pixels(scene, tmp_path, caplog, tolerance):
     folder = copytree(scene, tmp_path / "pair")
     with rasterio.open(folder / "truth.tif", "r+") as file:
         file.write(np.rint(file.read()))
-    done = invoke("calibrate", folder, "--output", tmp_path / "new.yaml", "--tolerance", tolerance, "--quiet")
-    assert done.exit_code == 0
-    assert ("pair has whole pixels only: try --tolerance 0.5" in done.stderr) == (tolerance == 0)
+    check_scenes(scenes_of([folder], (), Choices(tolerance=tolerance)))
+    assert ("pair has whole pixels only: try --tolerance 0.5" in caplog.text) == (tolerance == 0)
 
 
 def test_check_scenes__refuses_a_scene_that_counts_twice(scene, tmp_path):
