@@ -17,6 +17,7 @@ from sweeps import swept as make_sweep
 
 from sat_intervals import load_config, match_pair
 from sat_intervals.demo import Scene, make_scene
+from sat_intervals.kernels import registration
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.raster import write_layer
 from sat_intervals.workflows.demo import write_views
@@ -140,6 +141,12 @@ def small_pair(small_scene: Scene, tmp_path: Path) -> tuple[Path, dict[str, Any]
     tiles, cluster = {"size": 64, "overlap": 20}, {"workers": 1, "retries": 0}
     disparity = {"minimum": -18, "maximum": 40}
     return tmp_path, write_pair(tmp_path, small_scene, disparity=disparity, tiles=tiles, cluster=cluster)
+
+
+@pytest.fixture
+def thinned(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The search for the shift of a surface takes few points, and an eighth of the time."""
+    monkeypatch.setattr(registration, "_SEARCHED", 2000)
 
 
 @pytest.fixture

@@ -15,6 +15,8 @@ from sat_intervals import SatIntervalsError
 from sat_intervals.evaluate.surface_accuracy import evaluate_surface
 from sat_intervals.match.histogram import Histogram
 
+pytestmark = pytest.mark.usefixtures("thinned")
+
 
 def test_evaluate_surface__worked_example(tmp_path):
     # Reference: 10 in the first columns, then up 1 m a cell: slope 0 at the first cell, atan(1/2) = 26.6 degrees at the

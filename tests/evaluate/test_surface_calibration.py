@@ -14,6 +14,8 @@ from sat_intervals import SatIntervalsError
 from sat_intervals.config import load_height_calibration
 from sat_intervals.evaluate.surface_calibration import calibrate_surface
 
+pytestmark = pytest.mark.usefixtures("thinned")
+
 TAGS = {"INTERVAL": "median", "RADIUS": "1 m", "COVERAGE": "0.9", "RUNS": "2026"}
 TAGS |= {"HEIGHTS": "above the WGS 84 ellipsoid"}
 

@@ -86,10 +86,9 @@ def test_fitted__has_no_more_disparities_than_the_right_image_has_columns(scene)
     assert (cut.minimum, cut.maximum) == (found.minimum + 1, found.maximum - 2)
 
 
-@pytest.mark.parametrize("seed", [0, 3])
-def test_find_range__of_a_pair_that_shares_little_keeps_the_end_with_the_matches(seed):
+def test_find_range__of_a_pair_that_shares_little_keeps_the_end_with_the_matches():
     """15 % overlap: disparities near -530, and stray matches near 300, together beyond the columns of the image."""
-    wide = make_scene(300, 1187, seed=seed)
+    wide = make_scene(300, 1187, seed=3)
     left, right = wide.left[:, :620], wide.right[:, 527:1147]
     truth = wide.truth[:, 527:620] - 527
     found = searched(left, right).fitted(620)

@@ -21,7 +21,7 @@ def looks_at(left, right, scene):
     return [one for one in found if one is not None]
 
 
-@pytest.mark.parametrize("rows", [0, 1, 3, 6, -5])
+@pytest.mark.parametrize("rows", [0, 6, -5])
 def test_look__measures_the_rows_by_which_the_right_image_lies_lower(scene, rows):
     height = len(scene.left) - abs(rows)
     left = scene.left[max(0, rows) : max(0, rows) + height]

@@ -19,9 +19,8 @@ def scene():
 
 
 @pytest.fixture(scope="module")
-def other():
-    """Another place."""
-    return make_scene(260, 330, seed=8)
+def wide():
+    return make_scene(300, 460, seed=4)
 
 
 def lows(scene, folder, side):
@@ -104,11 +103,12 @@ def test_warnings_of__isolated_pixels_without_data(scene, tmp_path):
     assert "of the pixels are no data or masked, but spoil the windows of" in report["warnings"][0]
 
 
-def test_warnings_of__images_that_have_little_in_common(scene, other, tmp_path):
+def test_warnings_of__images_that_have_little_in_common(scene, wide, tmp_path):
     """As of dates before and after a change: cross-checking keeps most of it, with intervals as wide as the range."""
+    other = wide.left[: len(scene.right), : scene.right.shape[1]]
     for own, count in ((0.7, 0), (0.25, 1)):
         images = [tmp_path / f"{side}{count}.tif" for side in ("left", "right")]
-        for image, pixels in zip(images, (scene.left, own * scene.right + (1 - own) * other.left), strict=True):
+        for image, pixels in zip(images, (scene.left, own * scene.right + (1 - own) * other), strict=True):
             write_layer(image, pixels.astype(np.uint16), 0, PLACE)
         settings = {"disparity": {"minimum": scene.minimum, "maximum": scene.maximum}, "rows": "none"}
         report = match_pair(*images, tmp_path / str(count), settings)
@@ -117,9 +117,9 @@ def test_warnings_of__images_that_have_little_in_common(scene, other, tmp_path):
 
 
 @pytest.mark.parametrize("search", [(-180, -110), (40, 80)])
-def test_match__a_range_beside_the_truth_is_the_one_diagnosis(scene, tmp_path, search):
+def test_match__a_range_beside_the_truth_is_the_one_diagnosis(wide, tmp_path, search):
     """Rows are wrong, too, but the range is named, and the one to give."""
-    write_pair(tmp_path, scene)
+    write_pair(tmp_path, wide)
     images = tmp_path / "left.tif", tmp_path / "right.tif"
     for rows, status in (("auto", 2), ("none", 0)):
         out = tmp_path / rows
@@ -128,15 +128,16 @@ def test_match__a_range_beside_the_truth_is_the_one_diagnosis(scene, tmp_path, s
         assert result.exit_code == status
         searched = f"disparities {search[0]} to {search[1]} are searched, but have 0 % of the matches, which are at "
         there = re.search(searched + r"(\S+) to (\S+): give those, or leave out the range", line)
-        assert int(there[1]) <= scene.minimum
-        assert int(there[2]) >= scene.maximum
-    left, right = (np.ma.masked_equal(image, 0) for image in (scene.left, scene.right))
+        assert int(there[1]) <= wide.minimum
+        assert int(there[2]) >= wide.maximum
+    left, right = (np.ma.masked_equal(image, 0) for image in (wide.left, wide.right))
     with pytest.raises(SatIntervalsError, match=f"which are at {there[1]} to {there[2]}: give those, or leave"):
         match_arrays(left, right, {"disparity": {"minimum": search[0], "maximum": search[1]}})
 
 
-def test_prepare__refuses_an_unrelated_image(scene, other, tmp_path):
-    for side, pixels in (("left", scene.left), ("right", other.right)):
+def test_prepare__refuses_an_unrelated_image(tmp_path):
+    for side, seed in (("left", 1), ("right", 2)):
+        pixels = getattr(make_scene(300, 420, seed=seed), side)
         write_layer(tmp_path / f"{side}.tif", pixels, 0, PLACE)
     search = {"disparity": {"minimum": -30, "maximum": 40}}
     with pytest.raises(SatIntervalsError, match="check that both images show the same place"):

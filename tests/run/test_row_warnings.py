@@ -101,7 +101,7 @@ def test_match_pair__takes_a_plane_of_rows_out(folder, scene, tmp_path):
 
 @pytest.mark.usefixtures("runs")
 def test_match_pair__with_rows_taken_out_does_not_depend_on_tiles(folder, scene, tmp_path):
-    run(folder, tmp_path / "tiles", scene, tiles={"size": 64}, cluster={"workers": 2})
+    run(folder, tmp_path / "tiles", scene, tiles={"size": 128}, cluster={"workers": 2})
     assert hashes(folder / "auto") == hashes(tmp_path / "tiles")
     with rasterio.open(folder / "left.tif") as left, rasterio.open(folder / "right.tif") as right:
         arrays = (np.ma.masked_equal(file.read(1), 0) for file in (left, right))
@@ -127,8 +127,6 @@ def test_range_command__prints_the_rows(folder):
     assert result.exit_code == 0, result.output
     assert "rows of the two images" in result.stdout
     assert "taken out with rows auto" in result.stdout
-    survey = json.loads(invoke("range", folder / "left.tif", folder / "right.tif", "--json").stdout)["survey"]
-    assert survey["rows"]["before"][0] > 1
 
 
 def test_match_command__says_what_was_moved(runs):
