@@ -14,7 +14,7 @@ PARALLEL := -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 # Python keeps the bytecode of what it imports: each process would otherwise compile it again, in seconds.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-all lint bench bench-seams surface-bounds ablation tune calibration coverage pictures docs dist clean
+.PHONY: demo test test-marked test-all lint bench bench-seams surface-bounds ablation tune calibration coverage pictures docs dist clean
 
 demo: $(VENV)/.has-plot
 	$(BIN)/sat-intervals demo demo-out --overwrite --size 800 800
@@ -25,9 +25,11 @@ demo: $(VENV)/.has-plot
 test: $(READY)
 	$(PYTEST) $(PARALLEL) -m 'not process and not peer and not ported'
 
-# All tests. With OPTIONS=--skip-nothing a skipped test fails.
-test-all: $(READY) $(VENV)/.has-services
-	$(PYTEST) $(PARALLEL)
+# The other tests. With OPTIONS=--skip-nothing a skipped test fails.
+test-marked: $(READY) $(VENV)/.has-services
+	$(PYTEST) $(PARALLEL) -m 'process or peer or ported'
+
+test-all: test test-marked
 
 lint: $(READY) $(VENV)/.has-lint
 	$(BIN)/ruff check
