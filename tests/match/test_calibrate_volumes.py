@@ -48,7 +48,7 @@ def test_calibrate_volumes__reaches_a_coverage_on_other_scenes(scenes, tmp_path)
 
 
 def test_calibrate_volumes__judges_a_single_volume_in_blocks(scenes) -> None:
-    volume, truth = scenes[0]
+    volume, truth = (band[:60] for band in scenes[0])
     how = {"kind": "similarity", "span": 1, "config": {"cross_check": None}}
     half = calibrate_volumes([(volume[:, :, 8:], truth / 2)], DISPARITIES[8:] / 2, tolerance=0.25, **how)
     whole = calibrate_volumes([(volume[:, :, 8:], truth)], DISPARITIES[8:], tolerance=0.5, **how)
@@ -58,7 +58,7 @@ def test_calibrate_volumes__judges_a_single_volume_in_blocks(scenes) -> None:
 
 
 def test_calibrate_volumes__takes_a_mask_of_the_truth(scenes) -> None:
-    volume, truth = scenes[0]
+    volume, truth = (band[:60] for band in scenes[0])
     unknown = np.indices(truth.shape)[1] < 90
     masked = np.ma.array(np.where(unknown, -9999.0, truth), mask=unknown)
     how = {"disparities": DISPARITIES, "kind": "probability", "config": {"interval": {"coverage": 0.9}}}

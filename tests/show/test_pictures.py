@@ -136,13 +136,13 @@ def test_plot__without_matplotlib_says_what_to_install(tmp_path, monkeypatch):
 def test_pictures__of_any_size_and_of_no_valid_pixel(tmp_path, bands, shape):
     made = bands(*shape)
     results = open_results(write_run(tmp_path, *made[:2], truth=np.full(shape, -3.0)))
-    draw_overview(results, tmp_path / "overview.png", dpi=60)
-    draw_errors(results, tmp_path / "errors.png", dpi=60)
-    draw_profile(results, tmp_path / "profile.png", shape[0] // 2, dpi=60)
+    draw_overview(results, tmp_path / "overview.png", dpi=40)
+    draw_errors(results, tmp_path / "errors.png", dpi=40)
+    draw_profile(results, tmp_path / "profile.png", shape[0] // 2, dpi=40)
     for name in ("overview.png", "errors.png", "profile.png"):
         picture = pixels_of(tmp_path / name)
-        assert min(picture.shape[:2]) >= 60 * 3
-        assert max(picture.shape[:2]) <= 60 * 30
+        assert min(picture.shape[:2]) >= 40 * 3
+        assert max(picture.shape[:2]) <= 40 * 30
         assert 0.1 < share_of(picture, WHITE) < 0.97
     if bands is no_bands:
         assert share_of(pixels_of(tmp_path / "overview.png"), GREY) > 0.1
