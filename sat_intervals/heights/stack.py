@@ -32,8 +32,8 @@ _UNSURE = 0.1, 0.3
 # Cells of a level around a block of the next one that its range is made of, and the margin of the range: steps of the
 # level, and a share of the range.
 _BESIDE, _MARGIN = 4, (2, 0.1)
-# Sample blocks for shifts along each side of the grid, and their side in cells.
-_SAMPLES, _SIDE = 3, 96
+# Sample blocks for shifts along each side of the grid, of the cells and of coarse levels, and their side in cells.
+_SAMPLES, _SIDE = (3, 2), 96
 # Cells of sample blocks that an image must show to be compared with the others.
 _FEWEST = 500
 # Cells over which grey values are made alike.
@@ -147,10 +147,10 @@ def ranges_for(surface: Surface, stack: Stack, finer: Stack, factor: int) -> Loc
     return LocalRanges(first, last, BLOCK, BLOCK).clipped(search.minimum, search.maximum)
 
 
-def sample_cores(whole: Window) -> list[Window]:
-    """Return blocks spread over a grid."""
+def sample_cores(whole: Window, most: int = _SAMPLES[0]) -> list[Window]:
+    """Return blocks spread over a grid, ``most`` along each side."""
     starts = [
-        sorted({round(first) for first in np.linspace(0, max(0, size - _SIDE), min(_SAMPLES, -(-size // _SIDE)))})
+        sorted({round(first) for first in np.linspace(0, max(0, size - _SIDE), min(most, -(-size // _SIDE)))})
         for size in (whole.height, whole.width)
     ]
     return [Window(row, column, _SIDE, _SIDE).clipped(whole) for row in starts[0] for column in starts[1]]
@@ -179,9 +179,9 @@ def sample(stack: Stack, core: Window) -> Sample:
     return Sample(alike.astype(np.float32), surface.sure(_UNSURE[1]) & smooth, cell)
 
 
-def samples_of(stack: Stack, each: Each) -> list[Sample]:
+def samples_of(stack: Stack, each: Each, *, is_coarse: bool) -> list[Sample]:
     """Match sample blocks, and resample the images to them."""
-    cores = sample_cores(stack.whole)
+    cores = sample_cores(stack.whole, _SAMPLES[is_coarse])
     found = dict(each(sample, [(stack.around(core), core) for core in cores], "shifts"))
     return [found[i] for i in range(len(cores))]
 

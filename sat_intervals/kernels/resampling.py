@@ -122,7 +122,7 @@ def reduced(pixels: np.ndarray, state: np.ndarray, step: Step) -> np.ndarray:
     with np.errstate(over="ignore"):  # undeclared no data may be as large as a float32 can be
         for axis, size in enumerate(step):
             sums, counts = _added(sums, axis, size), _added(counts, axis, size)
-    return np.where(2 * counts >= step.rows * step.columns, sums / np.maximum(counts, 1), np.nan).astype(np.float32)
+    return np.where(counts >= step.rows * step.columns / 2, sums / np.maximum(counts, 1), np.nan).astype(np.float32)
 
 
 def _added(array: np.ndarray, axis: int, size: int) -> np.ndarray:

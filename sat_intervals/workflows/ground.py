@@ -76,10 +76,10 @@ class _Search:
         first, last = int(np.floor((heights[0] - base) / step)), int(np.ceil((heights[1] - base) / step))
         return Stack(images, replace(ground, base=base, step=step), level_config(self.config, first, last), None)
 
-    def align(self, stack: Stack) -> Stack:
+    def align(self, stack: Stack, *, is_coarse: bool) -> Stack:
         """Find shifts, in rounds while they are large; return the stack with them."""
         for _ in range(_ROUNDS):
-            found, self.alike = aligned(stack, samples_of(stack, self.each))
+            found, self.alike = aligned(stack, samples_of(stack, self.each, is_coarse=is_coarse))
             stack = self._moved(stack, found)
             if np.abs(found).max() < _SMALL * min(stack.ground.reductions):
                 break
@@ -97,7 +97,7 @@ class _Search:
             if before:
                 coarse, surface, coarser = before
                 stack = replace(stack, ranges=ranges_for(surface, coarse, stack, coarser // factor))
-            stack = self.align(stack)
+            stack = self.align(stack, is_coarse=factor > 1)
             if factor > 1:
                 before = stack, surface_of(stack, self.each), factor
         return stack
