@@ -69,11 +69,10 @@ def plan(
         config = config.model_copy(update={"disparity": found.config.disparity})
 
     def sample(out: Path, one: Config, window: Window) -> dict[str, float]:
+        progress("kernels", 0, 1)
+        compile_kernels(one)  # once a machine: a part of the first plan, not of the run
         return dict(match_pair(left, right, out, one, window=window, overwrite=True)["seconds"])
 
-    # Compiled once a machine: a part of the first plan, not of the run.
-    progress("kernels", 0, 1)
-    compile_kernels(config)
     return planned((left, right), region, config, sample, memory=memory, workers=workers)
 
 
