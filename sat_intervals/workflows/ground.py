@@ -85,12 +85,18 @@ class _Search:
                 break
         return stack
 
+    @property
+    def unlike(self) -> np.ndarray:
+        """Return which images are not like the others, but not those that show too few of the samples."""
+        middle = np.nanmedian(self.alike) if np.isfinite(self.alike).any() else np.nan
+        return np.asarray(self.alike < _UNLIKE * middle)
+
     def _moved(self, stack: Stack, shifts: np.ndarray) -> Stack:
         self.shifts = self.shifts + shifts
         return replace(stack, ground=stack.ground.shifted(shifts))
 
     def descend(self, cells: Cells, heights: tuple[float, float]) -> Stack:
-        """Match levels from coarse to fine; return the finest, with shifts and ranges, which is not matched."""
+        """Match levels from coarse to fine, until one shows an unlike image; return the last, which is not matched."""
         before: tuple[Stack, Surface, int] | None = None
         for factor in [*_factors(cells), 1]:
             stack = self.stack(cells, factor, heights)
@@ -98,6 +104,8 @@ class _Search:
                 coarse, surface, coarser = before
                 stack = replace(stack, ranges=ranges_for(surface, coarse, stack, coarser // factor))
             stack = self.align(stack, is_coarse=factor > 1)
+            if self.unlike.any():
+                break
             if factor > 1:
                 before = stack, surface_of(stack, self.each), factor
         return stack
@@ -129,7 +137,7 @@ def found_ground(
             found = _heights_of(surface_of(top, each), top, domain)
             cells = common_cells(search.sensors, projection, found, resolution, grid)
         stack = search.descend(cells, found)
-        unlike = search.alike < _UNLIKE * np.nanmedian(search.alike)  # not those that show too few of the samples
+        unlike = search.unlike
         if not unlike.any():
             break
         left_out += [one for one, is_unlike in zip(search.sensors, unlike, strict=True) if is_unlike]
