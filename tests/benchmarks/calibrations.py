@@ -61,6 +61,11 @@ def scenes_of(preset: str) -> tuple[str, ...]:
     return DEVELOPMENT + WORLDVIEW if preset.startswith("satellite") else DEVELOPMENT
 
 
+def group_of(scene: str) -> str:
+    """Return what is left out with a scene: tiles of one city are a group, close-range scenes are each on their own."""
+    return "_".join(scene.split("_")[:2])
+
+
 def search_of(scene: str) -> dict[str, int]:
     """Return the search range of a scene."""
     minimum, maximum = json.loads((DATA / scene / "meta.json").read_text())["disparity"]
@@ -77,7 +82,7 @@ def scene_of(scene: str, preset: str) -> CalibrationScene:
     config = load_config(settings_of(preset) | {"disparity": search_of(scene)})
     left, right = (open_image(DATA / scene / f"{side}.tif") for side in ("left", "right"))
     truth, tolerance = truth_of(left, DATA / scene / "truth.tif"), tolerance_of(scene)
-    return CalibrationScene(scene, scene, left, right, truth, config, None, tolerance, tolerance > 0)
+    return CalibrationScene(scene, group_of(scene), left, right, truth, config, None, tolerance, tolerance > 0)
 
 
 def remembered(make: Callable[..., list[np.ndarray]]) -> Callable[..., list[np.ndarray]]:
