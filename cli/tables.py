@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 _WIDEST = 10_000
 # What the nominal level of intervals is, in reports and for a reader.
 _NOMINAL = {"coverage": "coverage asked for", "alpha": "alpha"}
-_EXPECTED = ("all", "high", "low", "lowest", "mean_width", "median_width", "score")
+_EXPECTED = ("all", "high", "edge", "low", "lowest", "mean_width", "median_width", "score")
 
 
 def show(header: Sequence[str], rows: Sequence[Sequence[str]], title: str) -> None:
@@ -186,11 +186,13 @@ def show_calibration(calibration: "Calibration", expected: Sequence[dict[str, fl
     rows = []
     for row, levels in zip(expected, calibration.levels, strict=True):
         quantile = "none" if levels.quantile is None else f"{levels.quantile:g}"
-        figures = [_figure(row.get(key)) for key in _EXPECTED]
-        rows.append([f"{levels.coverage:g}", *figures, f"{levels.high:.4g}", f"{levels.low:.1f}", quantile])
-    is_factor = (calibration.key["refinement"] or {}).get("method") == "least_squares"
-    names = [key.replace("_", " ") for key in _EXPECTED]
-    header = ["coverage", *names, "factor high" if is_factor else "level high", "level low", "quantile"]
+        figures = [_figure(row.get(key)) for key in _EXPECTED if key != "edge" or levels.edge is not None]
+        high = [f"{level:.4g}" for level in (levels.high, levels.edge) if level is not None]
+        rows.append([f"{levels.coverage:g}", *figures, *high, f"{levels.low:.1f}", quantile])
+    has_edges = calibration.levels[0].edge is not None
+    names = [key.replace("_", " ") for key in _EXPECTED if key != "edge" or has_edges]
+    factors = ["factor high", "factor edge"] if has_edges else ["level high"]
+    header = ["coverage", *names, *factors, "level low", "quantile"]
     show(header, rows, "expected: coverage, widths and score (px) of pairs left out, and levels")
     for note in calibration.provenance["notes"]:
         click.echo(note)

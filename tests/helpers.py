@@ -51,7 +51,7 @@ def write_pair(folder: Path, scene: Scene, *, group: str = "all", **sections: An
 
 def calibration(config: Config, high: float, low: float, quantile: float | None) -> dict[str, Any]:
     """A calibration of some settings with the same levels for every coverage."""
-    row = {"high": high, "low": low, "quantile": quantile}
+    row = {"high": high, "edge": high, "low": low, "quantile": quantile}
     return {"name": "flat", "key": key_of(config), "levels": [{"coverage": c} | row for c in COVERAGES]}
 
 

@@ -44,13 +44,15 @@ class Levels(StrictModel):
 
     ``high`` and ``low``, of pixels of high and low confidence, are the excess ``S(d) - min S`` of the aggregated cost,
     in the unit of the kernels' integer costs: the sum over the 8 paths of SGM (one cost without SGM), times the `steps`
-    of the matching cost (1 for Census, 125 for MC-CNN). With least squares ``high`` is a factor instead, see
-    `refinement.bounds_of_both`. ``quantile`` None leaves low-confidence segments as they are.
+    of the matching cost (1 for Census, 125 for MC-CNN). With least squares ``high`` and ``edge``, of high confidence
+    on smooth ground and at edges, are factors instead, see `refinement.bounds_of_both`; else ``edge`` is None.
+    ``quantile`` None leaves low-confidence segments as they are.
     ``reached`` is False if the pairs of the calibration did not reach the coverage at any level.
     """
 
     coverage: float | None
     high: float = Field(ge=0, le=IMPOSSIBLE_COST)
+    edge: float | None = Field(None, ge=0, le=IMPOSSIBLE_COST)
     low: float = Field(ge=0, le=IMPOSSIBLE_COST)
     quantile: float | None = Field(ge=0.5, le=1)
     reached: bool = True
@@ -76,9 +78,9 @@ class Calibration(CalibrationFile):
             raise ValueError(f"coverages are {words[0]}, needed in this order: {words[1]}")
         for one, next_one in pairwise(rows):
             # low-confidence pixels may need a lower level with a higher quantile
-            for name in ("high", "low") if one.quantile == next_one.quantile else ("high",):
+            for name in ("high", "edge", "low") if one.quantile == next_one.quantile else ("high", "edge"):
                 before, after = getattr(one, name), getattr(next_one, name)
-                if after < before:
+                if before is not None and after is not None and after < before:
                     raise ValueError(
                         f"{name} falls from {before:g} at coverage {one.coverage:g} to {after:g} at "
                         f"{next_one.coverage:g}: a level may not fall"
@@ -176,5 +178,6 @@ def at(calibration: Calibration, coverage: float) -> Levels:
     one = calibration.levels[above - 1]
     share = (coverage - COVERAGES[above - 1]) / (COVERAGES[above] - COVERAGES[above - 1])
     high, low = one.high + share * (other.high - one.high), one.low + share * (other.low - one.low)
+    edge = None if one.edge is None or other.edge is None else one.edge + share * (other.edge - one.edge)
     low = low if one.quantile == other.quantile else other.low
-    return other.model_copy(update={"coverage": coverage, "high": high, "low": low})
+    return other.model_copy(update={"coverage": coverage, "high": high, "edge": edge, "low": low})

@@ -124,6 +124,8 @@ def calibration_of(config: Config) -> Calibration:
         return built_in(key, config.preset)
     if different := differences(given.key, key):
         raise ConfigError(f"calibration {given.name} belongs to other settings, {different[0]}: {MAKE_ONE}")
+    if config.fits and None in (levels.edge for levels in given.levels):
+        raise ConfigError(f"calibration {given.name} has no factors for edges, an older version made it: {MAKE_ONE}")
     return given
 
 

@@ -78,26 +78,31 @@ def low_confidence(confidence, threshold, kernel):
 
 
 @cached
-def rough(winner, kept, size, least):
-    """Pixels in whose window the winners of kept pixels differ by ``least`` or more.
+def surroundings(values, kept, size):
+    """Smallest and largest kept value in the window of each pixel, and whether all of its pixels in the image are kept.
 
-    winner, kept: ``(rows, columns)`` int16, and bool. size: side of the square window, odd.
-    Returns ``(rows, columns)`` bool.
+    values, kept: ``(rows, columns)`` float32, and bool. size: side of the square window, odd.
+    Returns three such arrays, float32 and bool; infinity and -infinity where nothing is kept.
     """
-    rows, columns = winner.shape
-    radius = size // 2
-    lowest, highest = np.empty(columns + 2 * radius, np.int16), np.empty(columns + 2 * radius, np.int16)
-    found = np.zeros((rows, columns), np.bool_)
+    rows, columns = values.shape
+    radius, none = size // 2, np.float32(np.inf)
+    lowest, highest = np.empty((rows, columns), np.float32), np.empty((rows, columns), np.float32)
+    whole = np.empty((rows, columns), np.bool_)
+    least, most = np.full(columns + 2 * radius, none), np.full(columns + 2 * radius, -none)
+    filled = np.ones(columns + 2 * radius, np.bool_)
     for r in range(rows):
-        lowest[:], highest[:] = 32767, -32768
+        inner = slice(radius, radius + columns)
+        least[inner], most[inner], filled[inner] = none, -none, True
         for i in range(max(0, r - radius), min(rows, r + radius + 1)):
             for c in range(columns):
-                if kept[i, c]:
-                    lowest[c + radius] = min(lowest[c + radius], winner[i, c])
-                    highest[c + radius] = max(highest[c + radius], winner[i, c])
-        for c in range(columns):
-            low, high = 32767, -32768
-            for j in range(size):
-                low, high = min(low, lowest[c + j]), max(high, highest[c + j])
-            found[r, c] = high - low >= least
-    return found
+                low, high = (values[i, c], values[i, c]) if kept[i, c] else (none, -none)
+                least[c + radius] = low if low < least[c + radius] else least[c + radius]
+                most[c + radius] = high if high > most[c + radius] else most[c + radius]
+                filled[c + radius] &= kept[i, c]
+        lowest[r], highest[r], whole[r] = none, -none, True
+        for j in range(size):
+            for c in range(columns):
+                lowest[r, c] = least[c + j] if least[c + j] < lowest[r, c] else lowest[r, c]
+                highest[r, c] = most[c + j] if most[c + j] > highest[r, c] else highest[r, c]
+                whole[r, c] &= filled[c + j]
+    return lowest, highest, whole

@@ -8,7 +8,17 @@ import numpy as np
 from sat_intervals.config import Calibration, Config, Interval, key_of
 from sat_intervals.config.calibration import COVERAGES
 from sat_intervals.match import postprocess
-from sat_intervals.match.measurement import FIELDS, HIGH, QUANTILES, SCHEMES, Measured, ThresholdSweep, measure
+from sat_intervals.match.measurement import (
+    EDGE,
+    FIELDS,
+    HIGH,
+    LOW,
+    QUANTILES,
+    SCHEMES,
+    Measured,
+    ThresholdSweep,
+    measure,
+)
 from sat_intervals.match.refinement import bounds_of_both
 from sat_intervals.products import INVALID
 
@@ -26,7 +36,9 @@ def pairs_of(thresholds: ThresholdSweep) -> list[tuple[int, int]]:
 
 def at_levels(config: Config, high: float, low: float, quantile: float | None) -> Config:
     """Return settings whose intervals are cut at two levels, whatever the coverage, and without local ranges."""
-    rows = [{"coverage": coverage, "high": high, "low": low, "quantile": quantile} for coverage in COVERAGES]
+    rows = [
+        {"coverage": coverage, "high": high, "edge": high, "low": low, "quantile": quantile} for coverage in COVERAGES
+    ]
     constant = Calibration.model_validate({"name": "constant", "key": key_of(config), "levels": rows})
     interval = Interval(coverage=Decimal(str(COVERAGES[0])), calibration=constant)
     disparity = config.disparity.model_copy(update={"local": False, "grid": None, "around": None})
@@ -73,8 +85,10 @@ class Gauge:
             rows = postprocess.filter_rows(one_cut, scale, config)
             here = postprocess.cut_rows(rows, inner.start, inner.stop)
             valid = (here.validity & INVALID == 0) & np.isfinite(truth[0])
+            assert here.low is not None
+            classes = np.where(here.low, LOW, here.edge if config.fits else HIGH)
             for number, scheme, bounds in self._bounds(rows, inner, threshold, config):
-                chosen = np.flatnonzero(valid & (here.low == (scheme != HIGH)))
+                chosen = np.flatnonzero(valid & (classes == min(scheme, LOW)))
                 middle, low, high, true, part = (band.ravel()[chosen] for band in (here.disparity, *bounds, *truth))
                 low, high = postprocess.widened(low, high, middle, config)
                 measured = measure(low, high, true, self._tolerance, part, len(self._tables))
@@ -85,10 +99,12 @@ class Gauge:
     ) -> Iterator[tuple[int, int, tuple[np.ndarray, np.ndarray]]]:
         """Yield the thresholds and schemes that the rows ``inner`` are measured for, and their bounds."""
         if threshold == OF_FITS:
-            fits, lower, upper = rows.fits(inner), rows.lower[inner], rows.upper[inner]
+            half = postprocess.cut_rows(rows.half, inner.start, inner.stop)
             for number, factor in enumerate(self._thresholds.high):
-                yield number, HIGH, bounds_of_both(fits, lower, upper, factor, config)
+                bounds = bounds_of_both(rows.disparity[inner], half, factor, config)
+                yield from ((number, scheme, bounds) for scheme in (HIGH, EDGE))
             return
-        for scheme, quantile in enumerate((None, *QUANTILES)):
-            if scheme != HIGH or self._thresholds.are_one:
-                yield threshold, scheme, postprocess.regularized(rows, inner.start, inner.stop, config, quantile)
+        if self._thresholds.are_one:
+            yield threshold, HIGH, (rows.lower[inner], rows.upper[inner])
+        for scheme, quantile in enumerate(QUANTILES, start=LOW):
+            yield threshold, scheme, postprocess.regularized(rows, inner.start, inner.stop, config, quantile)

@@ -11,8 +11,10 @@ from sat_intervals.config import Calibration, Config
 from sat_intervals.config.calibration import COVERAGES, Levels
 from sat_intervals.match.measurement import (
     COUNTS,
+    EDGE,
     HIGH,
     INSIDE,
+    LOW,
     MISSED,
     QUANTILES,
     WIDTH,
@@ -23,6 +25,8 @@ from sat_intervals.match.measurement import (
 )
 
 _USUAL_QUANTILE = 0.9
+# Classes of pixels, and their names in notes.
+_CLASSES = {"high": "high confidence", "edge": "high confidence at edges", "low": "low confidence"}
 # Of quantiles whose scores differ by less than this, the one with the narrowest intervals is chosen.
 _SAME_SCORE = 1.02
 
@@ -31,18 +35,18 @@ class Pool(NamedTuple):
     """Several measurements together.
 
     table: weighted sums ``(thresholds, schemes, fields)``.
-    pixels: number of pixels of high and of low confidence.
+    pixels: number of pixels of high confidence, of edges, and of low confidence.
     """
 
     table: np.ndarray
-    pixels: tuple[int, int]
+    pixels: tuple[int, int, int]
 
 
 def pooled(parts: Iterable[Measured]) -> Pool:
     """Put measurements together."""
     parts = list(parts)
-    high, low = np.sum([part.table[0, [HIGH, HIGH + 1], COUNTS:].sum(axis=-1) for part in parts], axis=0)
-    return Pool(np.asarray(sum(part.weight * part.table for part in parts)), (int(high), int(low)))
+    high, edge, low = np.sum([part.table[0, : LOW + 1, COUNTS:].sum(axis=-1) for part in parts], axis=0)
+    return Pool(np.asarray(sum(part.weight * part.table for part in parts)), (int(high), int(edge), int(low)))
 
 
 def calibration_of_parts(
@@ -57,13 +61,14 @@ def calibration_of_parts(
     for coverage, groups in zip(COVERAGES, left_out(parts, thresholds, COVERAGES), strict=True):
         levels, doubts = choose(pool, thresholds, coverage)
         levels = not_below(levels, chosen[-1] if chosen else None)
-        chosen.append(levels.model_copy(update={"high": round(levels.high, 3), "low": round(levels.low, 2)}))
+        rounded = {"high": round(levels.high, 3), "edge": levels.edge and round(levels.edge, 3)}
+        chosen.append(levels.model_copy(update=rounded | {"low": round(levels.low, 2)}))
         notes += [f"coverage {coverage:g}: {doubt}" for doubt in doubts]
         expected.append({"coverage": coverage, **means(groups.values())})
     provenance = {
         "software": f"sat-intervals {version('sat-intervals')}",
         "pairs": pairs,
-        "pixels": dict(zip(("high", "low"), pool.pixels, strict=True)),
+        "pixels": dict(zip(_CLASSES, pool.pixels, strict=True)),
         "notes": notes,
         "expected": [
             {key: round(value, 4) if isfinite(value) else None for key, value in row.items()} for row in expected
@@ -78,37 +83,40 @@ def choose(pool: Pool, sweep: ThresholdSweep, coverage: float) -> tuple[Levels, 
     Of the quantiles whose interval score is nearly the best, the one with the narrowest intervals is chosen. A class
     with fewer pixels than the larger of 200 and ``10 / (1 - coverage)`` takes the level of the other class: high
     confidence that of low confidence without regularisation, low confidence that of high with the usual quantile. If
-    both have few, or with least squares, each keeps its own.
+    both have few, or with least squares, each class, edges too, keeps its own.
 
     Returns the levels, and what a reader must know: a class with few pixels, or a coverage that no level reaches.
     """
     (table, pixels), notes = pool, list[str]()
     needed = ceil(max(200, 10 / (1 - coverage)) - 1e-9)
     few = [number < needed for number in pixels]
-    borrows = sweep.are_one and not all(few)
-    for name, other, number in zip(("high", "low"), ("low", "high"), pixels, strict=True):
-        if number < needed:
-            borrowed = f": the level of {other} confidence is used" if borrows else ""
-            notes.append(f"{number} pixels of {name} confidence, {needed} are needed{borrowed}")
-    high = _level(table[:, HIGH + (few[0] and borrows)], sweep.high, coverage)
-    if high is None and pixels[0]:
-        notes.append("high confidence does not reach it at any level")
+    borrows = sweep.are_one and not (few[HIGH] and few[LOW])
+    for (name, words), number in zip(_CLASSES.items(), pixels, strict=True):
+        if number < needed and not (name == "edge" and sweep.are_one):
+            other = _CLASSES["low" if name == "high" else "high"]
+            borrowed = f": the level of {other} is used" if borrows else ""
+            notes.append(f"{number} pixels of {words}, {needed} are needed{borrowed}")
+    high = _level(table[:, LOW if few[HIGH] and borrows else HIGH], sweep.high, coverage)
+    edge = _level(table[:, EDGE], sweep.high, coverage)
     most = float(sweep.low[-1])
     low: tuple[float, float | None] | None
-    if few[1] and borrows:
+    if few[LOW] and borrows:
         low = most if high is None else high, _USUAL_QUANTILE
-    elif (low := _best(table, sweep.low, coverage)) is None and pixels[1]:
-        notes.append("low confidence does not reach it at any level")
-    reached = not any(number and level is None for number, level in zip(pixels, (high, low), strict=True))
-    level, quantile = low or (most, QUANTILES[int(np.argmax(table[-1, HIGH + 1 :, INSIDE]))])  # it comes nearest
-    high = float(sweep.high[-1]) if high is None else high
-    return Levels(coverage=coverage, high=high, low=level, quantile=quantile, reached=reached), notes
+    else:
+        low = _best(table, sweep.low, coverage)
+    found = zip(_CLASSES.values(), pixels, (high, edge, low), strict=True)
+    missed = [f"{words} does not reach it at any level" for words, number, level in found if number and level is None]
+    level, quantile = low or (most, QUANTILES[int(np.argmax(table[-1, LOW:, INSIDE]))])  # it comes nearest
+    high, edge = (float(sweep.high[-1]) if one is None else one for one in (high, edge))
+    edge = None if sweep.are_one else edge
+    levels = Levels(coverage=coverage, high=high, edge=edge, low=level, quantile=quantile, reached=not missed)
+    return levels, notes + missed
 
 
 def _best(table: np.ndarray, levels: np.ndarray, coverage: float) -> tuple[float, float | None] | None:
     """Return level and quantile of low confidence; None if no quantile reaches the coverage."""
     found = []
-    for scheme, quantile in enumerate(QUANTILES, start=HIGH + 1):
+    for scheme, quantile in enumerate(QUANTILES, start=LOW):
         if (level := _level(table[:, scheme], levels, coverage)) is not None:
             fields = at_level(table[:, scheme], levels, level)
             found.append((level, quantile, interval_score(fields, coverage), fields[WIDTH]))
@@ -124,7 +132,8 @@ def not_below(levels: Levels, before: Levels | None) -> Levels:
     if before is None:
         return levels
     low = max(levels.low, before.low) if levels.quantile == before.quantile else levels.low
-    return levels.model_copy(update={"high": max(levels.high, before.high), "low": low})
+    edge = None if levels.edge is None else max(levels.edge, before.edge or 0)
+    return levels.model_copy(update={"high": max(levels.high, before.high), "edge": edge, "low": low})
 
 
 def _level(fields: np.ndarray, levels: np.ndarray, coverage: float) -> float | None:
@@ -168,16 +177,18 @@ def interval_score(fields: np.ndarray, coverage: float) -> float:
 
 
 def expected(table: np.ndarray, sweep: ThresholdSweep, levels: Levels) -> dict[str, float]:
-    """Coverage of all, high and low, widths in pixels and interval score with given levels; NaN without pixels."""
+    """Coverage of all and by class, widths in pixels and interval score with given levels; NaN without pixels."""
     assert levels.coverage is not None
-    high = at_level(table[:, HIGH], sweep.high, levels.high)
-    low = at_level(table[:, HIGH + 1 + QUANTILES.index(levels.quantile)], sweep.low, levels.low)
-    both = high + low
+    classes = {"high": at_level(table[:, HIGH], sweep.high, levels.high)}
+    if levels.edge is not None:
+        classes["edge"] = at_level(table[:, EDGE], sweep.high, levels.edge)
+    classes["low"] = at_level(table[:, LOW + QUANTILES.index(levels.quantile)], sweep.low, levels.low)
+    both = np.sum(list(classes.values()), axis=0)
     if not both[COUNTS:].sum():
-        return dict.fromkeys(("all", "high", "low", "mean_width", "median_width", "score"), np.nan)
+        return dict.fromkeys(("all", *classes, "mean_width", "median_width", "score"), np.nan)
     upto = np.cumsum(both[COUNTS:])
     return {
-        **{name: _share(fields, INSIDE) for name, fields in (("all", both), ("high", high), ("low", low))},
+        **{name: _share(fields, INSIDE) for name, fields in ({"all": both} | classes).items()},
         "mean_width": _share(both, WIDTH),
         "median_width": float(WIDTHS[np.searchsorted(upto, upto[-1] / 2)]),
         "score": interval_score(both, levels.coverage),

@@ -1,10 +1,10 @@
 """Measure intervals that were made at a sweep of thresholds against a truth (docs/coverage.md).
 
-Every pair is matched at each threshold of the levels, through the whole chain; factors are tried on one cut. Confidence
-classes are `HIGH` and low. Low-confidence pixels are measured once for each quantile of the regularisation, and once
-without it.
+Every pair is matched at each threshold of the levels, through the whole chain; factors are tried on one cut. Classes
+are `HIGH` confidence, with least squares without `EDGE`, and `LOW`. Low-confidence pixels are measured once for each
+quantile of the regularisation, and once without it.
 
-Letters of shapes: thresholds (levels of the sweep), schemes (high, then low with each of QUANTILES), fields.
+Letters of shapes: thresholds (levels of the sweep), schemes (high, edge, then low with each of QUANTILES), fields.
 """
 
 from math import ceil
@@ -16,7 +16,8 @@ from sat_intervals.config import Config
 
 # Quantiles of the regularisation that are tried; None: no regularisation.
 QUANTILES = (None, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
-HIGH, SCHEMES = 0, 1 + len(QUANTILES)
+HIGH, EDGE, LOW = 0, 1, 2
+SCHEMES = LOW + len(QUANTILES)
 
 # Thresholds: level 0, and from a fraction of the span to the level that holds every candidate, each 1.26 times the
 # one before.
@@ -56,7 +57,7 @@ class Measured(NamedTuple):
     @property
     def kept(self) -> int:
         """Return the number of kept pixels with truth."""
-        return int(self.table[0, [HIGH, HIGH + 1], COUNTS:].sum())
+        return int(self.table[0, : LOW + 1, COUNTS:].sum())
 
 
 class ThresholdSweep(NamedTuple):

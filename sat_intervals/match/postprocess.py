@@ -11,12 +11,12 @@ import numpy as np
 
 from sat_intervals import products
 from sat_intervals.config import Ambiguity, Config
-from sat_intervals.kernels.confidence import low_confidence, normalize, rough
+from sat_intervals.kernels.confidence import low_confidence, normalize, surroundings
 from sat_intervals.kernels.disparity import cross_check, median
 from sat_intervals.kernels.intervals import regularize
 from sat_intervals.kernels.matching import Raw, RightView
 from sat_intervals.match.histogram import quantile
-from sat_intervals.match.refinement import Refined, bounds_of_both, halo_of, refined, smoothed
+from sat_intervals.match.refinement import HalfWidths, Refined, bounds_of_both, half_widths, halo_of, refined, smoothed
 
 # Many images: side of the windows, and steps of height between their cells, that errors are larger in, whatever the
 # confidence: half widths of .9 fall from .99 to .49 m on ten images of a city if these cells count as uncertain.
@@ -62,6 +62,7 @@ class Filtered(NamedTuple):
     """Rows before regularisation: bands with their halo, low-confidence pixels (None without), pixels to write.
 
     deviation: of the fits of least squares, see `Refined`; empty without.
+    below, above, edge: see `HalfWidths`; empty without least squares and a coverage.
     """
 
     disparity: np.ndarray
@@ -72,10 +73,14 @@ class Filtered(NamedTuple):
     low: np.ndarray | None
     written: np.ndarray
     deviation: np.ndarray
+    below: np.ndarray = _EMPTY
+    above: np.ndarray = _EMPTY
+    edge: np.ndarray = _EMPTY
 
-    def fits(self, inner: slice) -> Refined:
-        """Return disparities and deviations of some rows."""
-        return Refined(self.disparity[inner], self.deviation[inner])
+    @property
+    def half(self) -> HalfWidths:
+        """Return the half widths."""
+        return HalfWidths(self.below, self.above, self.edge)
 
 
 class ConfidenceScale(NamedTuple):
@@ -119,9 +124,11 @@ def postprocess_rows(rows: RawRows, first: int, last: int, scale: ConfidenceScal
         assert low is not None
         validity[low[inner]] |= products.REGULARIZED
     if config.fits and cuts:
-        assert low is not None  # a coverage needs both classes
-        fits = filtered.fits(inner)
-        bounds = bounds_of_both(fits, filtered.lower[inner], filtered.upper[inner], cuts.high, config)
+        assert low is not None  # a coverage needs all classes
+        assert cuts.edge is not None
+        half = cut_rows(filtered.half, first, last)
+        factors = np.where(half.edge, cuts.edge, cuts.high)
+        bounds = bounds_of_both(filtered.disparity[inner], half, factors, config)
         lower, upper = (np.where(low[inner], old, new) for new, old in zip(bounds, (lower, upper), strict=True))
     disparity = np.where(filtered.written[inner], filtered.disparity[inner], np.float32(np.nan))
     bands = products.Bands(disparity, *widened(lower, upper, disparity, config), filtered.confidence[inner], validity)
@@ -148,7 +155,8 @@ def filter_rows(rows: RawRows, scale: ConfidenceScale, config: Config) -> Filter
     if config.regularization:
         low = low_confidence(confidence, config.regularization.threshold, config.regularization.kernel)
         if not config.cost.compares_two:
-            low |= rough(rows.winner, kept, *_ROUGH) & kept
+            lowest, highest, _ = surroundings(rows.winner.astype(np.float32), kept, _ROUGH[0])
+            low |= kept & (highest - lowest >= _ROUGH[1])
     disparity, (lower, upper) = rows.disparity, _bounds(rows, low, kept, config)
     if config.median:
         disparity = median(disparity, kept, config.median.size)
@@ -159,7 +167,11 @@ def filter_rows(rows: RawRows, scale: ConfidenceScale, config: Config) -> Filter
     elif config.has_planes:
         disparity = smoothed(disparity, kept, config)
     written = searched if config.products.keep_rejected else kept
-    return Filtered(disparity, lower, upper, confidence, validity, low, written, deviation)
+    filtered = Filtered(disparity, lower, upper, confidence, validity, low, written, deviation)
+    if config.fits and config.has_coverage:
+        half = half_widths(Refined(disparity, deviation), lower, upper, kept)
+        filtered = filtered._replace(**half._asdict())
+    return filtered
 
 
 def widened(

@@ -5,13 +5,15 @@ from typing import NamedTuple
 import numpy as np
 
 from sat_intervals.config import Config
+from sat_intervals.kernels.confidence import surroundings
 from sat_intervals.kernels.refinement import FIT, MARGIN, PLANE, facing_values, least_squares, on_planes
 from sat_intervals.tiling import Views, Window
 
-# Deviation in pixels that stands for a pixel without a fit, and what adds to a deviation and to a side of the cut.
-_NO_FIT = np.float32(1.0)
-_LEAST = np.float32(0.2)
-_SIDE = np.float32(0.3)
+# Deviation in pixels that stands for a pixel without a fit; what is added to a deviation, to a side of the cut, and to
+# relief.
+_NO_FIT, _HALF = np.float32(1.0), np.float32(0.5)
+# Side of the windows of relief, and the range of disparities in them from which on they hold an edge, in pixels.
+_AROUND, _EDGE = 9, 2
 
 
 class Refined(NamedTuple):
@@ -19,6 +21,14 @@ class Refined(NamedTuple):
 
     disparity: np.ndarray
     deviation: np.ndarray
+
+
+class HalfWidths(NamedTuple):
+    """Distances in pixels to the bounds of a factor of 1, float32, and which pixels are at edges, bool."""
+
+    below: np.ndarray
+    above: np.ndarray
+    edge: np.ndarray
 
 
 def pixel_windows(rows: Window, config: Config) -> tuple[Window, Window]:
@@ -49,8 +59,8 @@ def refined(disparity: np.ndarray, kept: np.ndarray, left: np.ndarray, right: np
 
 
 def halo_of(config: Config) -> int:
-    """Return the rows above and below that a refined disparity depends on: windows of fits, and of planes."""
-    return FIT * config.fits + PLANE * config.has_planes
+    """Return the rows above and below that refinement depends on: windows of fits, of planes, and of relief."""
+    return (FIT + _AROUND // 2) * config.fits + PLANE * config.has_planes
 
 
 def smoothed(disparity: np.ndarray, kept: np.ndarray, config: Config) -> np.ndarray:
@@ -60,12 +70,24 @@ def smoothed(disparity: np.ndarray, kept: np.ndarray, config: Config) -> np.ndar
     return np.where(kept, np.clip(smooth, config.disparity.minimum, config.disparity.maximum), disparity)
 
 
+def half_widths(fits: Refined, lower: np.ndarray, upper: np.ndarray, kept: np.ndarray) -> HalfWidths:
+    """Return what a cut, the precision of the fit, and the relief around give together; see `bounds_of_both`."""
+    disparity, deviation = fits
+    lowest, highest, whole = surroundings(disparity, kept, _AROUND)
+    scale = _HALF + np.where(np.isnan(deviation), _NO_FIT, deviation)
+    sides = ((disparity - lower, disparity - lowest), (upper - disparity, highest - disparity))
+    below, above = (
+        scale * (_HALF + np.maximum(cut, 0)) * np.sqrt(_HALF + np.maximum(relief, 0)) for cut, relief in sides
+    )
+    return HalfWidths(below, above, ~whole | (highest - lowest > _EDGE))
+
+
 def bounds_of_both(
-    fits: Refined, lower: np.ndarray, upper: np.ndarray, factor: float, config: Config
+    disparity: np.ndarray, half: HalfWidths, factor: np.ndarray | float, config: Config
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bounds that cost curve and fit give together, inside the search range."""
-    # On either side ``factor (.2 + deviation) (.3 + distance to the bound of the cut)`` from the disparity.
-    disparity, search = fits.disparity, config.disparity
-    scale = np.float32(factor) * (_LEAST + np.where(np.isnan(fits.deviation), _NO_FIT, fits.deviation))
-    below, above = (scale * (_SIDE + np.maximum(side, 0)) for side in (disparity - lower, upper - disparity))
-    return np.maximum(disparity - below, search.minimum), np.minimum(disparity + above, search.maximum)
+    """Return bounds by a factor for each pixel, or for all, inside the search range."""
+    search, scale = config.disparity, np.float32(factor)
+    return (
+        np.maximum(disparity - scale * half.below, search.minimum),
+        np.minimum(disparity + scale * half.above, search.maximum),
+    )

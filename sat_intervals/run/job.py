@@ -326,6 +326,7 @@ def _manifest(prepared: Prepared[FilePair], inputs: Mapping[str, Any], region: W
     if levels is not None:
         settings["interval"] = {
             "high": levels.high,
+            "edge": levels.edge,
             "low": levels.low,
             "steps": config.bound_steps,
             "cut": config.fit_cut,

@@ -16,7 +16,7 @@ def rising(**changes):
     """A calibration of the default settings with levels 0, 10, 20, ... and 0, 1, 2, ..., and changes to its rows."""
     values = calibration(load_config(RANGE), 0, 0, 0.9)
     for i, row in enumerate(values["levels"]):
-        row |= {"high": 10.0 * i, "low": float(i)} | changes.get(f"row_{i}", {})
+        row |= {"high": 10.0 * i, "edge": 20.0 * i, "low": float(i)} | changes.get(f"row_{i}", {})
     return values
 
 
@@ -30,6 +30,7 @@ def test_at__gives_the_rows_and_is_linear_between() -> None:
         assert at(loaded, coverage) == loaded.levels[i]
     assert numbers(at(loaded, 0.925)) == pytest.approx((55, 5.5, 0.9))
     assert at(loaded, 0.925).coverage == 0.925
+    assert at(loaded, 0.925).edge == pytest.approx(110)
 
 
 def test_at__between_two_quantiles_takes_level_and_quantile_of_the_larger_coverage() -> None:
@@ -72,6 +73,7 @@ def test_load_calibration__reads_a_file_and_a_run_keeps_its_content(tmp_path) ->
             rising(row_4={"high": 20.0}),
             "levels: high falls from 30 at coverage 0.8 to 20 at 0.85: a level may not fall",
         ),
+        (rising(row_4={"edge": 20.0}), "levels: edge falls from 60 at coverage 0.8 to 20 at 0.85"),
         (rising(row_4={"low": 0.5}), "levels: low falls from 3 at coverage 0.8 to 0.5 at 0.85"),
         (rising(row_4={"coverage": 0.84}), "levels: coverages are 0.5, 0.6, 0.7, 0.8, 0.84, 0.9"),
         (rising(row_4={"high": -1.0}), "levels.4.high: input should be greater than or equal to 0"),
@@ -100,6 +102,12 @@ def test_load_config__a_calibration_is_no_file_of_settings(tmp_path) -> None:
 def test_load_calibration__names_a_missing_file() -> None:
     with pytest.raises(ConfigError, match=r"calibration no.yaml: No such file or directory .*sat-intervals calibrate"):
         load_calibration("no.yaml")
+
+
+def test_calibration_of__an_older_one_has_no_factors_for_edges() -> None:
+    config = load_config(RANGE, {"interval": {"coverage": 0.9, "calibration": rising(row_4={"edge": None})}})
+    with pytest.raises(ConfigError, match="calibration flat has no factors for edges, an older version made it: make"):
+        calibration_of(config)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from sat_intervals.config import Ambiguity
-from sat_intervals.kernels.confidence import low_confidence, normalize, rough
+from sat_intervals.kernels.confidence import low_confidence, normalize, surroundings
 from sat_intervals.kernels.cost import Codes, between
 from sat_intervals.kernels.matching import match_costs
 from sat_intervals.kernels.sweeps import Settings
@@ -124,16 +124,17 @@ def test_low_confidence__equals_reference(confidence, threshold, kernel):
     np.testing.assert_array_equal(low_confidence(confidence, threshold, kernel), expected)
 
 
-# ---- Rough winners -------------------------------------------------------------------------------------------
+# ---- Surroundings --------------------------------------------------------------------------------------------
 @few
 @given(data=st.data(), shape=hnp.array_shapes(min_dims=2, max_dims=2, max_side=8))
-def test_rough__equals_a_slow_twin(data, shape):
-    winner = data.draw(hnp.arrays(np.int16, shape, elements=st.integers(-9, 9)))
+def test_surroundings__equals_a_slow_twin(data, shape):
+    values = data.draw(hnp.arrays(np.float32, shape, elements=st.sampled_from([-2.5, 0, 1, 7.25])))
     kept = data.draw(hnp.arrays(bool, shape))
-    size, least = data.draw(st.sampled_from([1, 3, 5])), data.draw(st.integers(1, 12))
-    expected = np.zeros(shape, bool)
+    values[~kept & data.draw(hnp.arrays(bool, shape))] = N
+    size = data.draw(st.sampled_from([1, 3, 5, 9]))
+    lowest, highest, whole = surroundings(values, kept, size)
     for r, c in np.ndindex(shape):
         around = tuple(slice(max(0, i - size // 2), i + size // 2 + 1) for i in (r, c))
-        there = winner[around][kept[around]]
-        expected[r, c] = there.size > 0 and np.ptp(there) >= least
-    np.testing.assert_array_equal(rough(winner, kept, size, least), expected)
+        there = values[around][kept[around]]
+        assert (lowest[r, c], highest[r, c]) == (there.min(initial=np.inf), there.max(initial=-np.inf))
+        assert whole[r, c] == kept[around].all()

@@ -10,9 +10,11 @@ from sat_intervals.config.calibration import COVERAGES, Calibration
 from sat_intervals.match.levels import choose, expected, left_out, means, not_below, pooled
 from sat_intervals.match.measurement import (
     COUNTS,
+    EDGE,
     FIELDS,
     HIGH,
     INSIDE,
+    LOW,
     MISSED,
     QUANTILES,
     SCHEMES,
@@ -28,12 +30,12 @@ SWEEP = ThresholdSweep(LEVELS, LEVELS)
 PART = np.zeros(4, np.int64)
 
 
-def part(needed_high, needed_low, group="one", widen=None):
+def part(needed_high, needed_low, group="one", widen=None, needed_edge=()):
     """A measurement of pixels that need these levels; an interval is as wide as its level, or as ``widen`` tells."""
     table = np.zeros((LEVELS.size, SCHEMES, FIELDS))
     for threshold, level in enumerate(LEVELS):
         for scheme in range(SCHEMES):
-            needed = np.asarray(needed_high if scheme == HIGH else needed_low, float)
+            needed = np.asarray({HIGH: needed_high, EDGE: needed_edge}.get(scheme, needed_low), float)
             width = np.full(needed.size, widen(scheme, level) if widen else level)
             truth = np.where(needed <= level, 0.0, width + 1)  # missed by 1 px
             table[threshold, scheme] = measure(0 * width, width, truth, 0.0, np.zeros(needed.size, int), 1)[0]
@@ -71,7 +73,11 @@ def test_choose__factors_and_levels_have_rungs_of_their_own():
     choice, _ = choose(pool, factors, 0.9)
     one, _ = choose(pool, SWEEP, 0.9)
     assert (8 * choice.high, choice.low) == (one.high, one.low)
-    few, notes = choose(pooled([part([4] * 2000, [20] * 190)]), factors, 0.9)
+    assert choice.edge == factors.high[-1]  # no edges, and none of these levels is for them
+    pool = pooled([part([4] * 2000, [20] * 2000, needed_edge=[20] * 2000)])
+    assert 8 * choose(pool, factors, 0.9)[0].edge == choose(pool, factors, 0.9)[0].low
+    assert one.edge is None
+    few, notes = choose(pooled([part([4] * 2000, [20] * 190, needed_edge=[20] * 300)]), factors, 0.9)
     assert few.low > 16  # not that of the other class, which is a factor
     assert notes == ["190 pixels of low confidence, 200 are needed"]
 
@@ -134,7 +140,7 @@ def test_choose__says_what_no_level_reaches():
     assert (choice.high, choice.reached) == (LEVELS[-1], False)
     assert notes == ["high confidence does not reach it at any level"]
     low = part([1] * 1000, [1e9] * 500 + [1] * 500)
-    low.table[:, 1 + QUANTILES.index(0.8), INSIDE] += 1
+    low.table[:, LOW + QUANTILES.index(0.8), INSIDE] += 1
     choice, notes = choose(pooled([low]), SWEEP, 0.9)
     assert (choice.low, choice.quantile, choice.reached) == (LEVELS[-1], 0.8, False)  # it comes nearest
     assert notes == ["low confidence does not reach it at any level"]
@@ -142,10 +148,10 @@ def test_choose__says_what_no_level_reaches():
 
 def test_choose__the_narrowest_of_nearly_the_best_scores():
     def widen(scheme, level):
-        return level * {3: 0.99, 4: 1.0}.get(scheme, 2.0)
+        return level * {LOW + 2: 0.99, LOW + 3: 1.0}.get(scheme, 2.0)
 
     choice, _ = choose(pooled([part([4] * 1000, [4] * 1000, widen=widen)]), SWEEP, 0.9)
-    assert choice.quantile == QUANTILES[3 - 1]
+    assert choice.quantile == QUANTILES[2]
 
 
 def test_left_out__judges_a_group_with_levels_of_the_others():

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from sat_intervals.config import load_config
+from sat_intervals.kernels.refinement import MARGIN
+from sat_intervals.match.gauge import at_levels
 from sat_intervals.match.postprocess import (
     ConfidenceScale,
     RawRows,
@@ -32,11 +34,25 @@ def raw_rows() -> RawRows:
     return RawRows(winner, lower, upper, disparity, ambiguity, validity, lower, upper, right)
 
 
-@pytest.mark.parametrize("sections", [{}, {"median": {"size": 7}, "regularization": {"depth": 4}}, {"median": None}])
+def fitted_rows() -> RawRows:
+    """Raw rows whose disparities are about 0, with walls, and images that least squares can fit."""
+    random, raw = np.random.default_rng(1), raw_rows()
+    flat = (random.random((ROWS, COLUMNS)) < 0.97) & (raw.winner != NO_DISPARITY)
+    disparity = np.where(flat, random.uniform(-0.4, 0.4, flat.shape), raw.disparity).astype(np.float32)
+    other = random.normal(500, 80, (ROWS, COLUMNS + COUNT - 1 + 2 * MARGIN)).astype(np.float32)
+    left = other[:, MARGIN - MINIMUM :][:, :COLUMNS] + np.float32(5)
+    return raw._replace(winner=np.where(flat, 0, raw.winner), disparity=disparity, left=left, right=other)
+
+
+@pytest.mark.parametrize(
+    "sections",
+    [{}, {"median": {"size": 7}, "regularization": {"depth": 4}}, {"median": None}, {"preset": "satellite"}],
+)
 def test_postprocess_strip__equals_the_whole_region_in_every_bit(sections):
     search = {"minimum": MINIMUM, "maximum": MINIMUM + COUNT - 1}
     config = load_config({"preset": "paper", "disparity": search, "cross_check": {"tolerance": 9}} | sections)
-    raw, scale, margin = raw_rows(), ConfidenceScale(3.0, 70.0), halo(config)
+    config = at_levels(config, 0.5, 100, 0.9) if config.fits else config
+    raw, scale, margin = fitted_rows() if config.fits else raw_rows(), ConfidenceScale(3.0, 70.0), halo(config)
     whole = postprocess_rows(raw, 0, ROWS, scale, config)
     assert (whole.validity & REGULARIZED != 0).any()
     for first in range(0, ROWS, 32):

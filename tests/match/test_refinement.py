@@ -6,7 +6,16 @@ import reference
 from numpy.testing import assert_allclose, assert_array_equal
 
 from sat_intervals import load_config, match_arrays
-from sat_intervals.match.refinement import Refined, bounds_of_both, pixel_windows, pixels_of, refined, smoothed
+from sat_intervals.match.refinement import (
+    HalfWidths,
+    Refined,
+    bounds_of_both,
+    half_widths,
+    pixel_windows,
+    pixels_of,
+    refined,
+    smoothed,
+)
 from sat_intervals.match.whole import cut, whole_view
 from sat_intervals.products import INVALID, NOT_REFINED, REGULARIZED
 from sat_intervals.tiling import Window
@@ -88,15 +97,27 @@ def test_validity__bit_3_is_of_pixels_that_neither_refinement_has_moved(method):
         assert without.mean() < 0.2
 
 
-def test_bounds_of_both__worked_example():
+def test_half_widths__worked_example():
+    fits = Refined(np.float32([[5, 5, 5, 19]]), np.float32([[0.1, np.nan, 0.1, 0.1]]))
+    lower, upper = np.float32([[4.5, 4.5, 5.2, 18]]), np.float32([[5.7, 5.7, 6.2, 20]])
+    below, above, edge = half_widths(fits, lower, upper, np.array([[True, True, True, False]]))
+    # (.5 + .1) (.5 + .5) sqrt(.5); without a fit (.5 + 1); a cut beyond the disparity leaves .5; 14 px above others
+    root, far = np.sqrt([0.5, 14.5])
+    assert_allclose(below, [[0.6 * root, 1.5 * root, 0.3 * root, 0.9 * far]], rtol=1e-6)
+    assert_allclose(above, [[0.72 * root, 1.8 * root, 1.02 * root, 0.9 * root]], rtol=1e-6)
+    assert edge.all()  # a pixel around is missing
+    flat, step = np.zeros((1, 12), np.float32), np.repeat(np.float32([[0, 3]]), [4, 8], axis=1)
+    kept = np.ones(flat.shape, bool)
+    assert not half_widths(Refined(flat, flat), flat, flat, kept).edge.any()
+    assert_array_equal(np.flatnonzero(half_widths(Refined(step, flat), step, step, kept).edge), range(8))
+
+
+def test_bounds_of_both__stay_in_the_search_range():
     config = load_config({"preset": "satellite", "disparity": {"minimum": 0, "maximum": 20}})
-    fits = Refined(np.float32([5, 5, 5, 19]), np.float32([0.1, np.nan, 0.1, 0.1]))
-    lower, upper = bounds_of_both(fits, np.float32([4.5, 4.5, 5.2, 18]), np.float32([5.7, 5.7, 6.2, 20]), 2.0, config)
-    # 2 (.2 + .1) (.3 + .5) = .48; without a fit 2 (.2 + 1) (.3 + .5) = 1.92; a cut beyond the disparity leaves .3
-    assert_allclose(lower, [5 - 0.48, 5 - 1.92, 5 - 0.18, 19 - 0.78], rtol=1e-6)
-    assert_allclose(upper, [5 + 0.6, 5 + 2.4, 5 + 0.9, 19 + 0.78], rtol=1e-6)
-    wide = bounds_of_both(fits, np.float32([4.5] * 4), np.float32([5.7] * 4), 1000.0, config)
-    assert_array_equal(wide, [[0] * 4, [20] * 4])
+    half = HalfWidths(np.float32([1, 2]), np.float32([3, 4]), np.array([False, True]))
+    disparity = np.float32([5, 5])
+    assert_array_equal(bounds_of_both(disparity, half, np.array([2, 0.5]), config), [[3, 4], [11, 7]])
+    assert_array_equal(bounds_of_both(disparity, half, 1000.0, config), [[0, 0], [20, 20]])
 
 
 def test_refined__only_where_it_is_kept():

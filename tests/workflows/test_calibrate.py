@@ -10,13 +10,15 @@ import rasterio
 import yaml
 from helpers import PLACE, invoke, write_pair
 
-from sat_intervals import SatIntervalsError, match_pair, open_image
+from sat_intervals import SatIntervalsError, match_arrays, match_pair, open_image
 from sat_intervals.config import PRESETS, Cluster, calibration_of, load_calibration, load_config
 from sat_intervals.config.calibration import COVERAGES
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import ChangedInputError
 from sat_intervals.evaluate.disparity import evaluate_run
+from sat_intervals.kernels.confidence import surroundings
 from sat_intervals.match.gauge import pairs_of
+from sat_intervals.products import INVALID, REGULARIZED
 from sat_intervals.raster import write_layer
 from sat_intervals.run import measure
 from sat_intervals.run.calibrate import check_scenes
@@ -34,6 +36,11 @@ def scene(tmp_path_factory):
     assert result.exit_code == 0, result.output
     (folder / "said").write_text(result.output)
     return folder
+
+
+def read_masked(path):
+    with rasterio.open(path) as file:
+        return file.read(1, masked=True)
 
 
 def calibrated(folder, output, *options):
@@ -60,6 +67,22 @@ def test_calibrate__a_run_with_its_levels_has_the_coverage(scene, tmp_path, cove
     report = evaluate_run(tmp_path, scene / "truth.tif")
     for name in ("all", "high", "low"):
         assert report[name]["accuracy"] == pytest.approx(coverage, abs=0.02), name
+
+
+def test_calibrate__smooth_ground_and_edges_each_have_the_coverage(scene):
+    """On the pair of the calibration itself; edges have a larger factor."""
+    calibration = load_calibration(scene / "calibration.yaml")
+    settings = settings_with(scene, coverage=0.9, calibration=calibration)
+    left, right, truth = (read_masked(scene / f"{name}.tif") for name in ("left", "right", "truth"))
+    found = match_arrays(left, right, settings)
+    disparity, valid = found.disparity.values, found.validity.values & INVALID == 0
+    lowest, highest, whole = surroundings(disparity, valid, 9)
+    edge = ~whole | (highest - lowest > 2)
+    inside = (found.lower.values <= truth) & (truth <= found.upper.values)
+    judged = valid & np.isfinite(truth.filled(np.nan)) & (found.validity.values & REGULARIZED == 0)
+    for where in (edge, ~edge):
+        assert inside[judged & where].mean() == pytest.approx(0.9, abs=0.02)
+    assert calibration.levels[5].edge > calibration.levels[5].high
 
 
 def test_calibrate__the_file_says_what_to_expect(scene):
@@ -282,6 +305,7 @@ def test_load_calibration__built_in_ones_come_from_the_command_and_expect_more_o
     found = load_calibration(preset)
     for levels in found.levels:
         assert (round(levels.high, 3), round(levels.low, 2)) == (levels.high, levels.low)
+        assert (levels.edge is not None) == ("satellite" in preset)
     figures = found.provenance["expected"]
     assert [row["coverage"] for row in figures] == list(COVERAGES)
     for name in ("all", "high", "low", "mean_width", "median_width"):
