@@ -127,7 +127,7 @@ def postprocess_rows(rows: RawRows, first: int, last: int, scale: ConfidenceScal
         assert low is not None  # a coverage needs all classes
         assert cuts.edge is not None
         half = cut_rows(filtered.half, first, last)
-        factors = np.where(half.edge, cuts.edge, cuts.high)
+        factors = np.where(half.edge, np.float32(cuts.edge), np.float32(cuts.high))
         bounds = bounds_of_both(filtered.disparity[inner], half, factors, config)
         lower, upper = (np.where(low[inner], old, new) for new, old in zip(bounds, (lower, upper), strict=True))
     disparity = np.where(filtered.written[inner], filtered.disparity[inner], np.float32(np.nan))

@@ -22,7 +22,7 @@ from sat_intervals.workflows.sources import Source, find_sources
 _HEAD = """\
 # Calibration: levels of the cost curve, and factors, that reach a coverage, found by sat-intervals calibrate.
 # Use it with: sat-intervals match LEFT RIGHT OUT --coverage 0.9 --calibration FILE, with the settings of `key`.
-# `expected`: figures of pairs with the levels found on the other pairs; coverage of all, high and low confidence.
+# `expected`: figures of pairs with the levels found on the other pairs; coverage of all, high, edge and low confidence.
 """
 
 
