@@ -108,8 +108,8 @@ def _demo_of_many(
     if not run.as_json:
         console.summary_of_many(report, out)
         console.say(
-            f"The interval contains the true height for {100 * figures['coverage']:.1f} % of the cells; NMAD of height "
-            f"- truth {figures['nmad']:.2f} m."
+            f"The interval contains the true height for {100 * figures['coverage']:.1f} % of the cells, once the "
+            f"surface is moved onto the truth; NMAD of height - truth {figures['nmad']:.2f} m."
         )
     run.check_strict(report["warnings"])
 

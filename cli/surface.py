@@ -42,7 +42,7 @@ def surface(
     --geoid. The same as `rectify`, `match` and `dsm`, with their options and files.
 
     Three raw images and more are compared at heights above the ground, all at once (preset many), and their models are
-    shifted to fit each other: the more images, the more accurate, and the narrower the intervals.
+    shifted to fit each other: the more images, the more accurate.
 
     To resume, rerun the same command: what is finished with these images and settings is kept.
     """

@@ -173,10 +173,11 @@ def sample(stack: Stack, core: Window) -> Sample:
     """Match a core, and resample the images to its surface; runs on a worker."""
     surface, views = _matched(stack, core)
     disparity = np.nan_to_num(median(surface.disparity, np.isfinite(surface.disparity), 3))
-    found = [ortho(stack.ground, n, view, core, disparity) for n, view in enumerate(views)]
-    alike, cell = (np.stack(part) for part in zip(*((_alike(values), cell) for values, cell in found), strict=True))
+    places = [stack.ground.positions(n, core, disparity) for n in range(len(views))]
+    alike = np.stack([_alike(ortho(view, there)) for view, there in zip(views, places, strict=True)])
+    cell = np.stack([[np.diff(there, axis=axis).mean(axis=(0, 1)) for axis in (0, 1)] for there in places])
     smooth = maximum_filter(disparity, _FLAT[0]) - minimum_filter(disparity, _FLAT[0]) <= _FLAT[1]
-    return Sample(alike.astype(np.float32), surface.sure(_UNSURE[1]) & smooth, cell)
+    return Sample(alike.astype(np.float32), surface.sure(_UNSURE[1]) & smooth, cell.swapaxes(1, 2))
 
 
 def samples_of(stack: Stack, each: Each, *, is_coarse: bool) -> list[Sample]:
@@ -243,21 +244,15 @@ def _equations(one: Sample, shifts: np.ndarray) -> np.ndarray:
     return result
 
 
-def ortho(
-    ground: GroundViews, image: int, view: View, core: Window, disparity: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return an image resampled to the surface of a core, and how positions (pixels) change along cells, ``(2, 2)``."""
-    places = ground.positions(image, core, disparity)
-    cell = np.stack(
-        [np.diff(places, axis=axis).mean(axis=(0, 1)) for axis in (0, 1)], axis=-1
-    )  # [pixel axis, cell axis]
+def ortho(view: View, places: np.ndarray) -> np.ndarray:
+    """Return an image resampled to positions of cells, ``(rows, columns, 2)``, see `GroundViews.positions`."""
     nodes = np.pad(places, ((0, 1), (0, 1), (0, 0)), mode="edge")
     around = Window.around(places.min(axis=(0, 1)) - BEFORE, places.max(axis=(0, 1)) + AFTER + 1)
     pixels = np.full((around.height, around.width), np.float32(np.nan))
     inside = around.clipped(view.window)
     if inside.height and inside.width:
         pixels[inside.relative_to(around).slices] = view.pixels[inside.relative_to(view.window).slices]
-    return resample(pixels, (around.row, around.column), nodes, 1, (0, 0), *disparity.shape), cell
+    return np.asarray(resample(pixels, (around.row, around.column), nodes, 1, (0, 0), *places.shape[:2]))
 
 
 def _alike(values: np.ndarray) -> np.ndarray:

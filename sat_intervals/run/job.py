@@ -32,7 +32,6 @@ from sat_intervals.tiling import Grid, Tile, Window
 
 # Settings without effect on tiles; those of the preset itself are listed one by one.
 _NOT_OF_TILES = {"preset", "rows", "median", "regularization", "products", "cluster"}
-# Files of `ONCE`.
 _RANGE, _GROUND = "range", "ground"
 _REMOTE = "check URL and credentials, and pip install the package of its file system ('sat-intervals[remote]' for S3)"
 _NO_TILES = Grid(Window(0, 0, 0, 0), 1)

@@ -27,6 +27,8 @@ from sat_intervals.raster import Projection
 
 # Factors of the cells of levels, and cells along a side of a level at least.
 _FACTORS, _LEAST = (512, 128, 32, 8, 2), 48
+# Share of the cells of the coarsest level that are too doubtful for the range of heights: roofs are among the next.
+_DOUBTFUL = 0.1
 # Share of the cells of the coarsest level beyond the range of heights at each end; its margin: steps, and a share.
 _BEYOND, _MARGIN = 0.005, (3, 0.15)
 # Rounds of matching and shifts at a level, and the shifts after which there is no other, in pixels of the level.
@@ -186,7 +188,7 @@ def _factors(cells: Cells) -> list[int]:
 
 def _heights_of(surface: Surface, stack: Stack, domain: tuple[float, float]) -> tuple[float, float]:
     """Return the range of the heights of most cells of a level, in metres."""
-    found = surface.disparity[surface.sure(0.3)]
+    found = surface.disparity[surface.sure(_DOUBTFUL)]
     if not found.size:
         raise SatIntervalsError(
             "nowhere on the grid do two images show the same ground: check the grid, no-data values and masks"

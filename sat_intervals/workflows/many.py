@@ -16,7 +16,7 @@ from sat_intervals.prepare.pair import Each, FilePair
 from sat_intervals.prepare.prepared import Prepared
 from sat_intervals.products import plain
 from sat_intervals.progress import Progress, logged_stage
-from sat_intervals.raster import Image, Projection, north_up, utm_of
+from sat_intervals.raster import Image, Projection, find_model, north_up, utm_of
 from sat_intervals.raster.identity import check_not_replaced, identities, identity
 from sat_intervals.raster.publishing import check_free
 from sat_intervals.results import open_run
@@ -119,7 +119,8 @@ def asked_of(images: Sequence[Image], out: Path, config: Config, wanted: Wanted,
     named = {f"image_{number}": image for number, image in enumerate(images, start=1)}
     inputs = describe_inputs(named, config, {})
     outputs = [*outputs_of(config), *([ORTHO] if wanted.ortho else [])]
-    files = wanted.geoid, *wanted.models
+    found = (model for one in images if (model := find_model(one.path)) != one.path)
+    files = wanted.geoid, *(wanted.models or found)
     like = [wanted.resolution] if isinstance(wanted.resolution, Path) else []
     check_not_replaced([*identities(inputs), *files, *like], [out / name for name in outputs], [home_of(out)])
     if wanted.ortho and read_report(out) is None:
@@ -151,8 +152,10 @@ def _check_images(images: Sequence[Image], wanted: Wanted) -> None:
 def complete_sweep(asked: Asked, out: Path, *, keep_tiles: bool) -> dict[str, Any] | None:
     """Return the report of a complete run of a request, and remove tiles that a death left; None without."""
     before = read_report(out)
-    if not before or before.get("sweep", {}).get("request") != asked.request:
+    if not before:
         return None
+    if before.get("sweep", {}).get("request") != asked.request:
+        raise SatIntervalsError(f"{out} holds another run: give another folder, or --overwrite (overwrite=True)")
     if asked.wanted.ortho and not (out / ORTHO).exists():
         return None
     with locked(out):

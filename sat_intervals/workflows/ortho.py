@@ -47,5 +47,5 @@ def _window(job: Job, ground: GroundViews, window: Window) -> np.ndarray:
     disparity = (np.where(known, heights, np.median(heights[known])) - ground.base) / ground.step
     ends = int(np.floor(disparity.min())), int(np.ceil(disparity.max()))
     views = read_reduced_views(job.images.values(), ground.windows(window, *ends), ground.reductions)
-    found = np.stack([ortho(ground, n, view, window, disparity)[0] for n, view in enumerate(views)])
+    found = np.stack([ortho(view, ground.positions(n, window, disparity)) for n, view in enumerate(views)])
     return np.where(known, median_of(found), np.float32(np.nan)).astype(np.float32)

@@ -40,7 +40,7 @@ def surface(
     out: str | Path,
     config: Any = None,
     *,
-    resolution: float | Path,
+    resolution: float | str | Path,
     crs: str | None = None,
     radius: float | None = None,
     geoid: str | Path | None = None,
@@ -109,6 +109,7 @@ def surface(
     """
     opened = [one if isinstance(one, Image) else open_image(one) for one in images]
     config, out, geoid = load_config(config, images=len(opened)), Path(out), Path(geoid) if geoid else None
+    resolution = Path(resolution) if isinstance(resolution, str) else resolution
     choices, raw = choices or SurfaceChoices(), {"dem": dem, "altitude": altitude, "resolution_of": resolution_of}
     of_points = None if choices == SurfaceChoices() else choices
     if len(opened) < 2:
