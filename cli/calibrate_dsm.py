@@ -14,7 +14,8 @@ if TYPE_CHECKING:
 _HEIGHTS = """\
 # Calibration of heights: metres that widen the intervals of a surface model, found by sat-intervals calibrate --dsm.
 # Use it with: sat-intervals dsm OUT --calibration FILE, with the options that the surface was made with.
-# `below`: end of a class of interval widths; `margin`: both bounds move outwards by it, inwards if negative (metres).
+# Classes, in metres: `relief_below`: their end of the range of heights in 5 x 5 cells, `half_width_below`: that of half
+# the width of the interval. `margin`: both bounds move outwards by it, inwards if negative.
 """
 
 
@@ -41,22 +42,22 @@ def _show(calibration: "HeightCalibration") -> None:
     """Print the margins of each class, and what to expect."""
     from sat_intervals.cli.tables import show
 
-    start, rows = 0.0, []
-    for kind in calibration.classes:
-        ends = f"from {start:g}" if kind.below is None else f"{start:g} to {kind.below:g}"
-        rows.append([f"width {ends} m", str(kind.cells), f"{kind.margin:+.2f}"])
-        start = kind.below or 0.0
+    rows = [
+        [*("others" if end is None else f"below {end:g}" for end in ends), str(kind.cells), f"{kind.margin:+.2f}"]
+        for kind in calibration.classes
+        for ends in [(kind.relief_below, kind.half_width_below)]
+    ]
     title = f"both bounds move outwards by the margin, for coverage {calibration.coverage:g}"
-    show(["", "cells", "margin (m)"], rows, title)
+    show(["range in 5 x 5 cells (m)", "half width (m)", "cells", "margin (m)"], rows, title)
     found = calibration.provenance
     if found["shift"] is not None:
         east, north, up = found["shift"]
         click.echo(f"reference moved: easting {east:+.2f} m, northing {north:+.2f} m, height {up:+.2f} m")
-    keys = "coverage", "lowest", "median_width", "mean_width"
+    keys = "coverage", "lowest", "median_half_width", "mean_half_width"
     figures = {"before": found["before"], "calibrated on the other blocks": found["expected"] or {}}
     rows = [
         [name, *("-" if one.get(key) is None else f"{one[key]:.3f}" for key in keys)] for name, one in figures.items()
     ]
-    header = ["", "coverage", "lowest", "median width (m)", "mean width (m)"]
-    show(header, rows, "coverage and widths: before, and expected on ground that was held out")
+    header = ["", "coverage", "lowest", "median half width (m)", "mean half width (m)"]
+    show(header, rows, "coverage and half widths: before, and expected on ground that was held out")
     warn(found["warnings"])

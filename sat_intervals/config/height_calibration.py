@@ -2,10 +2,11 @@
 
 import os
 from collections.abc import Mapping
-from itertools import pairwise
+from itertools import groupby, pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import numpy as np
 from pydantic import Field, field_validator
 
 from sat_intervals.config.calibration import SETTINGS, CalibrationFile, checked, differences
@@ -20,56 +21,69 @@ _OF_INTERVALS = (
 _LARGEST = 10_000.0  # metres
 
 
-class WidthClass(StrictModel):
-    """Intervals narrower than ``below`` (metres, None: all others), whose bounds move outwards by ``margin`` metres.
+class HeightClass(StrictModel):
+    """Cells whose heights differ around them, and whose half widths are, by less than limits (metres, None: others).
 
-    ``cells`` is the number of cells that it was found from.
+    Their bounds move outwards by ``margin`` metres, which was found from so many ``cells``.
     """
 
-    below: float | None = Field(gt=0)
+    relief_below: float | None = Field(gt=0)
+    half_width_below: float | None = Field(gt=0)
     margin: float = Field(ge=-_LARGEST, le=_LARGEST)
     cells: int = Field(ge=1)
 
 
 class HeightCalibration(CalibrationFile):
-    """Margins of the intervals of a surface model, by class of width from narrow to wide.
+    """Margins of the intervals of a surface model, by class of relief, and in each of half width, rising.
 
     ``coverage`` is the share of true heights inside. If the reference was ``registered`` to the surface, the margins do
     not include a constant shift. ``surface`` says what surfaces they belong to, see `surface_key`.
     """
 
+    version: Literal[2] = 2
     name: str
     coverage: float = Field(gt=0, lt=1)
     registered: bool
     surface: dict[str, str]
-    classes: tuple[WidthClass, ...] = Field(strict=False, min_length=1)
+    classes: tuple[HeightClass, ...] = Field(strict=False, min_length=1)
     provenance: dict[str, Any] = Field(default_factory=dict)
 
     @field_validator("classes")
     @classmethod
-    def _check_order(cls, classes: tuple[WidthClass, ...]) -> tuple[WidthClass, ...]:
-        *limits, last = (kind.below for kind in classes)
-        if last is not None or None in limits:
-            raise ValueError("below is to be null in the last class, and a number of metres in the others")
-        for one, other in pairwise(limit for limit in limits if limit is not None):
-            if other <= one:
-                raise ValueError(f"below falls from {one:g} to {other:g}: it is to rise from class to class")
+    def _check_order(cls, classes: tuple[HeightClass, ...]) -> tuple[HeightClass, ...]:
+        _check_rising("relief_below", [relief for relief, _ in _by_relief(classes)])
+        for _, kinds in _by_relief(classes):
+            _check_rising("half_width_below", [kind.half_width_below for kind in kinds])
         return classes
 
-    @property
-    def limits(self) -> list[float]:
-        """Return the widths between the classes in metres."""
-        return [kind.below for kind in self.classes if kind.below is not None]
-
-    @property
-    def margins(self) -> list[float]:
-        """Return the margin of each class in metres."""
-        return [kind.margin for kind in self.classes]
+    def table(self) -> tuple[np.ndarray, tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+        """Return limits of relief, and of each class of relief limits of half width and margins."""
+        groups = _by_relief(self.classes)
+        relief = np.array([limit for limit, _ in groups if limit is not None])
+        half_widths = (
+            np.array([kind.half_width_below for kind in kinds[:-1]], dtype=np.float64) for _, kinds in groups
+        )
+        return relief, tuple(half_widths), tuple(np.array([kind.margin for kind in kinds]) for _, kinds in groups)
 
     def check_surface(self, key: Mapping[str, str]) -> None:
         """Raise if the calibration belongs to other surfaces than one with this key."""
         if different := differences(self.surface, key, "the surface"):
             raise ConfigError(f"calibration {self.name} belongs to other surfaces, {different[0]}: {_MAKE_ONE}")
+
+
+def _by_relief(classes: tuple[HeightClass, ...]) -> list[tuple[float | None, list[HeightClass]]]:
+    """Return the limits of relief, each with its classes."""
+    return [(limit, list(kinds)) for limit, kinds in groupby(classes, lambda kind: kind.relief_below)]
+
+
+def _check_rising(name: str, limits: list[float | None]) -> None:
+    """Raise if limits do not rise to the last one, which is None."""
+    *others, last = limits
+    if last is not None or None in others:
+        raise ValueError(f"{name} is to be null in the last class, and a number of metres in the others")
+    for one, other in pairwise(limit for limit in others if limit is not None):
+        if other <= one:
+            raise ValueError(f"{name} falls from {one:g} to {other:g}: it is to rise from class to class")
 
 
 def surface_key(tags: Mapping[str, str], cell: float) -> dict[str, str]:
@@ -92,4 +106,6 @@ def load_height_calibration(path: str | os.PathLike[str]) -> HeightCalibration:
         raise ConfigError(f"{file} is a calibration of disparities: give it to match; for heights {_MAKE_ONE}")
     if "classes" not in values and values.keys() & SETTINGS:
         raise ConfigError(f"{file} has settings, not a calibration: {_MAKE_ONE}")
+    if "classes" in values and "version" not in values:
+        raise ConfigError(f"{file} is of an earlier version, with margins by width alone: {_MAKE_ONE}")
     return checked(HeightCalibration, values, str(file))

@@ -18,17 +18,21 @@ _NORMAL = 1.4826
 
 
 class Heights(NamedTuple):
-    """Heights of cells, their bounds, and reference heights: ``(n,)`` metres; NaN bounds without an interval."""
+    """Heights of cells, their bounds, reference heights and relief, see `relief_of`: ``(n,)`` metres.
+
+    Bounds are NaN without an interval.
+    """
 
     height: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
     reference: np.ndarray
+    relief: np.ndarray
 
     @property
-    def width(self) -> np.ndarray:
-        """Return the widths of the intervals."""
-        return np.asarray(self.upper - self.lower)
+    def half_width(self) -> np.ndarray:
+        """Return half the widths of the intervals."""
+        return np.asarray((self.upper - self.lower) / 2)
 
     @property
     def outside(self) -> np.ndarray:
@@ -56,8 +60,8 @@ class Accuracy:
         self._sum += float(error.sum())
         self._squares += float(np.square(error).sum())
         self._errors.add(error)
-        bounded = cells.of(np.isfinite(cells.width))
-        self._intervals.add(np.maximum(bounded.outside, 0), bounded.width)
+        bounded = cells.of(np.isfinite(cells.half_width))
+        self._intervals.add(np.maximum(bounded.outside, 0), 2 * bounded.half_width)
 
     def report(self) -> dict[str, Any]:
         """Return all figures, None without cells: metres, and shares of cells with an interval."""

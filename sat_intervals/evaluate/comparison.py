@@ -9,6 +9,7 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.accuracy import LARGEST, Heights
+from sat_intervals.kernels.conformal import AROUND, relief_of
 from sat_intervals.kernels.registration import REACH, every_nth, put_together, register, spread_blocks
 from sat_intervals.kernels.relief import sampled
 from sat_intervals.raster import GROUND, Georeferencing, read_heights, read_layers, read_place, surface_place
@@ -118,13 +119,19 @@ def tiles(given: Comparison) -> Iterator[Window]:
 def compared(given: Comparison, window: Window) -> tuple[Heights, np.ndarray]:
     """Read the cells of a tile that both have a height, once for each reference height; and the mask of these."""
     finer = given.finer
-    height, lower, upper = (
-        np.repeat(np.repeat(band, finer, axis=0), finer, axis=1)
-        for band in read_layers(given.surface, window)[:3].astype(np.float64)
+    height, lower, upper, relief = (
+        np.repeat(np.repeat(band, finer, axis=0), finer, axis=1) for band in _bands(given, window)
     )
     reference = given.heights(*given.cells(window, finer), needed=np.isfinite(height))
     known = np.isfinite(reference) & np.isfinite(height)
-    return Heights(height, lower, upper, reference).of(known), known
+    return Heights(height, lower, upper, reference, relief).of(known), known
+
+
+def _bands(given: Comparison, window: Window) -> np.ndarray:
+    """Return height, both bounds and relief of a window of cells: ``(4, rows, columns)``."""
+    around = window.grown(AROUND, AROUND).clipped(Window(0, 0, *given.shape))
+    bands = read_layers(given.surface, around)[:3].astype(np.float64)
+    return np.concatenate([bands, relief_of(bands[0])[np.newaxis]])[:, *window.relative_to(around).slices]
 
 
 def registered(given: Comparison) -> tuple[Comparison, list[str]]:

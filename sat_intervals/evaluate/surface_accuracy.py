@@ -83,7 +83,7 @@ def evaluate_surface(
         cells, known = compared(moved, window)
         whole.add(cells)
         slopes.add(cells, _slope(moved, window)[known])
-        halves.add(cells, cells.width / 2)
+        halves.add(cells, cells.half_width)
         if classes is not None:
             for number, chosen in _classes(given, Path(classes), window, known):
                 kinds.setdefault(number, Accuracy(nominal)).add(cells.of(chosen))

@@ -1,7 +1,7 @@
 """Calibrate the intervals of a surface model in metres, against reference heights.
 
-The margins are those of split-conformal prediction, by class of width. Expected figures are those of blocks of ground
-that were held out.
+The margins are those of split-conformal prediction, by class of relief and half width. Expected figures are those of
+blocks of ground that were held out.
 """
 
 from collections.abc import Mapping
@@ -11,25 +11,33 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sat_intervals.config import HeightCalibration, WidthClass, surface_key
+from sat_intervals.config import HeightCalibration, HeightClass, surface_key
 from sat_intervals.config.calibration import COVERAGES
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.accuracy import Heights
 from sat_intervals.evaluate.comparison import Comparison, check_common, compared, open_comparison, registered, tiles
-from sat_intervals.kernels.conformal import least_number, margins, widened
+from sat_intervals.kernels.conformal import Margins, least_number, limits_between, margin_of, widened
 from sat_intervals.raster import read_tags
 
 _MOST = 1 << 20  # heights that are used: a sample, if there are more
-# Classes with the same number of cells, fewer with few cells; blocks along each side of the ground.
-_CLASSES, _BLOCKS = (8, 4, 2, 1), 4
+# Classes of relief, and of half width in each, fewer with few cells; blocks along each side of the ground.
+_CLASSES, _BLOCKS = 4, 4
 
 
-class Margins(NamedTuple):
-    """Limits of the width classes, with the margin and the number of cells of each class."""
+class Fit(NamedTuple):
+    """Margins, and the number of cells of each class: of each class of relief ``(n,)``."""
 
-    limits: np.ndarray
-    margins: np.ndarray
-    cells: np.ndarray
+    margins: Margins
+    cells: tuple[np.ndarray, ...]
+
+    def classes(self) -> tuple[HeightClass, ...]:
+        """Return the classes of a calibration."""
+        relief, *parts = self.margins
+        return tuple(
+            HeightClass(relief_below=below, half_width_below=limit, margin=float(margin), cells=round(float(cells)))
+            for below, *kinds in zip([*relief.tolist(), None], *parts, self.cells, strict=True)
+            for limit, margin, cells in zip([*kinds[0].tolist(), None], *kinds[1:], strict=True)
+        )
 
 
 def calibrate_surface(
@@ -50,10 +58,10 @@ def calibrate_surface(
 
     Returns
     -------
-    The calibration, for `SurfaceChoices`: ``classes`` have margins in metres, by width. Its ``provenance`` has the
+    The calibration, for `SurfaceChoices`: ``classes`` have margins in metres. Its ``provenance`` has the
     files, the shift of the reference, and figures: ``before`` and ``expected``, those of blocks of ground with the
-    margins of the other blocks (None with too few cells): coverage, median and mean width in metres; ``lowest``, the
-    smallest coverage of a block; ``warnings``, lines.
+    margins of the other blocks (None with too few cells): coverage, median and mean half width in metres; ``lowest``,
+    the smallest coverage of a block; ``warnings``, lines.
 
     Raises
     ------
@@ -67,7 +75,7 @@ def calibrate_surface(
     is_moved = moved.registration is not None
     sample, block, cells_of_height = _sample(moved)
     warnings += _datum_warnings(moved, sample)
-    bounded = np.isfinite(sample.width)
+    bounded = np.isfinite(sample.half_width)
     sample, block = sample.of(bounded), block[bounded]
     fit = fitted(sample, cells_of_height, coverage)
     if fit is None:
@@ -77,11 +85,6 @@ def calibrate_surface(
             f"{given.reference}{once}, {least_number(coverage)} are needed for coverage {coverage:g}: give a larger "
             "reference"
         )
-    limits = [float(limit) for limit in fit.limits]
-    classes = tuple(
-        WidthClass(below=limit, margin=float(margin), cells=round(float(cells)))
-        for limit, margin, cells in zip([*limits, None], fit.margins, fit.cells, strict=True)
-    )
     provenance = {
         "software": f"sat-intervals {version('sat-intervals')}",
         "surface": str(given.surface),
@@ -96,7 +99,7 @@ def calibrate_surface(
         coverage=coverage,
         registered=is_moved,
         surface=surface_key(tags, given.cell),
-        classes=classes,
+        classes=fit.classes(),
         provenance=provenance,
     )
 
@@ -122,7 +125,7 @@ def _coarser(given: Comparison) -> float:
 def _sample(given: Comparison) -> tuple[Heights, np.ndarray, float]:
     """Return heights, `_MOST` at most by chance, the block of ground of each, and the cells that one stands for."""
     random = np.random.default_rng(0)
-    parts = [np.empty((6, 0))]
+    parts = [np.empty((7, 0))]
     common = 0
     gathered = 0
     share = 1.0
@@ -160,19 +163,21 @@ def _datum_warnings(given: Comparison, sample: Heights) -> list[str]:
     return warnings
 
 
-def fitted(sample: Heights, cells_of_height: float, coverage: float) -> Margins | None:
-    """Return margins by classes of width, of one class with few cells; None with too few for that."""
-    width = sample.width
-    for count in _CLASSES if width.size else ():
-        # between centimetres, so that rounding does not part intervals of one width
-        limits = np.unique(np.round(np.round(np.quantile(width, np.arange(1, count) / count), 2) + 0.005, 3))
-        limits = limits[limits < width.max()]
-        kinds = np.searchsorted(limits, width, side="right")
-        cells = cells_of_height * np.bincount(kinds, minlength=limits.size + 1)
-        if cells.min() >= least_number(coverage):
-            found = margins(sample.outside, kinds, cells.size, coverage)
-            return Margins(limits, np.ceil(1000 * found) / 1000, cells)  # millimetres
-    return None
+def fitted(sample: Heights, cells_of_height: float, coverage: float) -> Fit | None:
+    """Return margins by classes of relief and half width, of fewer classes with few cells; None with too few."""
+    half, least = sample.half_width, least_number(coverage) / cells_of_height
+    if half.size < least:
+        return None
+    relief = limits_between(sample.relief, _CLASSES, least)
+    limits, margins, cells = [], [], []
+    for kind in range(relief.size + 1):
+        own = np.searchsorted(relief, sample.relief, side="right") == kind
+        limits.append(limits_between(half[own], _CLASSES, least))
+        classes, outside = np.searchsorted(limits[-1], half[own], side="right"), sample.outside[own]
+        found = [margin_of(outside[classes == number], coverage) for number in range(limits[-1].size + 1)]
+        margins.append(np.ceil(1000 * np.array(found)) / 1000)  # millimetres
+        cells.append(cells_of_height * np.bincount(classes))
+    return Fit(Margins(relief, tuple(limits), tuple(margins)), tuple(cells))
 
 
 def held_out(sample: Heights, block: np.ndarray, cells_of_height: float, coverage: float) -> Heights | None:
@@ -182,7 +187,8 @@ def held_out(sample: Heights, block: np.ndarray, cells_of_height: float, coverag
         fit = fitted(sample.of(~own), cells_of_height, coverage)
         if fit is None:
             return None
-        lower[own], upper[own] = widened(*sample.of(own)[:3], fit.limits, fit.margins)
+        part = sample.of(own)
+        lower[own], upper[own] = widened(*part[:3], fit.margins.of(part.half_width, part.relief))
     return sample._replace(lower=lower, upper=upper)
 
 
@@ -199,7 +205,7 @@ def _expected(
 
 
 def _figures(sample: Heights) -> dict[str, float]:
-    """Return coverage, median and mean width of intervals."""
-    inside, width = sample.outside <= 0, sample.width
-    figures = {"coverage": inside.mean(), "median_width": np.median(width), "mean_width": width.mean()}
+    """Return coverage, median and mean half width of intervals."""
+    inside, half = sample.outside <= 0, sample.half_width
+    figures = {"coverage": inside.mean(), "median_half_width": np.median(half), "mean_half_width": half.mean()}
     return {name: round(float(value), 4) for name, value in figures.items()}

@@ -12,7 +12,7 @@ import numpy as np
 from sat_intervals.config import HeightCalibration
 from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.point_cloud import Cells, PointCloud
-from sat_intervals.kernels.conformal import widened
+from sat_intervals.kernels.conformal import AROUND, Margins, relief_of, widened
 from sat_intervals.kernels.gridding import BOUNDED, CONFIDENCE, COUNT, HEIGHT, LOWER, UPPER, WEIGHT
 from sat_intervals.match.histogram import Histogram
 from sat_intervals.products import SURFACE
@@ -24,27 +24,51 @@ _STRIP_CELLS, _LOWEST = 1 << 21, 64
 _LISTED = 1 << 24  # bounds listed for the medians of a tile: 4 bytes each
 _STEPS, _WIDEST = 50, 1000  # widths are counted in steps of 2 cm, up to so many metres
 _NARROWEST = 0.01  # metres: narrower intervals weigh as much as one of this width
+Strip = tuple[int, np.ndarray, Counter[str]]  # see `strips`
 WIDE = 20.0  # metres: half widths from this on are reported as a share
 
 
 def strips(
     threads: ThreadPoolExecutor, clouds: Sequence[PointCloud], cells: Cells, radius: float, choices: SurfaceChoices
-) -> Iterator[tuple[int, np.ndarray, Counter[str]]]:
+) -> Iterator[Strip]:
     """Yield first row, bands of SURFACE ``(6, rows, columns)``, and counts of full-width strips from the top."""
+    parts = _strips(threads, clouds, cells, radius, choices)
+    for row, bands, counts in parts if choices.calibration is None else _calibrated(parts, choices.calibration):
+        counts["poor_cells"] += without_poor_cells(bands, choices.max_width, None)
+        yield row, bands, counts
+
+
+def _calibrated(parts: Iterator[Strip], calibration: HeightCalibration) -> Iterator[Strip]:
+    """Yield strips with calibrated intervals, which depend on the heights of two rows above and below."""
+    strip: Strip | None = next(parts)
+    above = np.empty((0, 0), np.float32)
+    while strip is not None:
+        following = next(parts, None)
+        heights = strip[1][0]
+        near = [above] * bool(above.size) + [heights] + ([following[1][0, :AROUND]] if following else [])
+        relief = relief_of(np.concatenate(near))[len(above) :][: len(heights)]
+        above = heights[-AROUND:].copy()
+        calibrate(strip[1], relief, calibration)
+        yield strip
+        strip = following
+
+
+def _strips(
+    threads: ThreadPoolExecutor, clouds: Sequence[PointCloud], cells: Cells, radius: float, choices: SurfaceChoices
+) -> Iterator[Strip]:
+    """Yield strips without a calibration, and with intervals of any width."""
     ended = threading.Event()
 
     def tile(window: Window) -> tuple[np.ndarray, Counter[str]]:
         gathered, counts = zip(*(cloud.splat(cells, window, radius, ended) for cloud in clouds), strict=True)
         bands = fused(gathered)
-        if choices.calibration is not None:
-            calibrate(bands, choices.calibration)
-        poor = without_poor_cells(bands, choices.max_width, choices.min_confidence)
+        poor = without_poor_cells(bands, None, choices.min_confidence)
         return bands, sum(counts, Counter(poor_cells=poor))
 
     rows, columns = _tile_size(clouds, cells, radius, choices)
     running: deque[tuple[int, list[Future[tuple[np.ndarray, Counter[str]]]]]] = deque()
 
-    def finished() -> tuple[int, np.ndarray, Counter[str]]:
+    def finished() -> Strip:
         row, tiles = running.popleft()
         bands, counts = zip(*(future.result() for future in tiles), strict=True)
         return row, np.concatenate(bands, axis=2), sum(counts, Counter())
@@ -71,7 +95,7 @@ def _tile_size(clouds: Sequence[PointCloud], cells: Cells, radius: float, choice
     if choices.bounds == "median":
         reaching = max(1.0, math.pi * (radius / cells.resolution) ** 2)  # cells that a point reaches
         most = _LISTED / reaching * min(cloud.ground.pixel_area for cloud in clouds) / cells.resolution**2
-        rows = max(1, min(rows, int(math.sqrt(most))))
+        rows = max(AROUND, min(rows, int(math.sqrt(most))))
         columns = max(1, min(columns, int(most / rows)))
     # equal parts
     rows, columns = (-(-whole // -(-whole // most)) for whole, most in ((cells.rows, rows), (cells.columns, columns)))
@@ -119,11 +143,10 @@ def _mean(weights: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.asarray(np.nansum(weights * values, axis=0) / total)
 
 
-def calibrate(bands: np.ndarray, calibration: HeightCalibration) -> None:
+def calibrate(bands: np.ndarray, relief: np.ndarray, calibration: HeightCalibration) -> None:
     """Widen or narrow the intervals of cells by the margins of a calibration, in place."""
-    limits, margins = np.array(calibration.limits), np.array(calibration.margins)
     height, lower, upper = bands[:3].astype(np.float64)
-    lower, upper = widened(height, lower, upper, limits, margins)
+    lower, upper = widened(height, lower, upper, Margins(*calibration.table()).of((upper - lower) / 2, relief))
     bands[1], bands[2] = _outwards(lower, -np.inf), _outwards(upper, np.inf)
 
 

@@ -1,6 +1,43 @@
-"""Margins that make intervals reach a coverage: split-conformal prediction by class of width (Vovk et al. 2005)."""
+"""Margins that make intervals reach a coverage: split-conformal prediction by class (Vovk et al. 2005)."""
+
+from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+AROUND = 2
+"""Cells on each side of a cell whose heights make its relief."""
+
+
+class Margins(NamedTuple):
+    """Margins in metres of classes of relief, and in each of them of half width.
+
+    relief: ``(classes - 1,)`` limits.
+    half_widths, margins: of each class of relief limits ``(n - 1,)`` and margins ``(n,)``.
+    """
+
+    relief: np.ndarray
+    half_widths: tuple[np.ndarray, ...]
+    margins: tuple[np.ndarray, ...]
+
+    def of(self, half_width: np.ndarray, relief: np.ndarray) -> np.ndarray:
+        """Return the margin of each cell; any shape."""
+        kinds, found = np.searchsorted(self.relief, relief, side="right"), np.empty(half_width.shape)
+        for kind, (limits, margins) in enumerate(zip(self.half_widths, self.margins, strict=True)):
+            own = kinds == kind
+            found[own] = margins[np.searchsorted(limits, half_width[own], side="right")]
+        return found
+
+
+def relief_of(height: np.ndarray) -> np.ndarray:
+    """Return the range of the known heights in 5 x 5 cells around each: ``(rows, columns)``, NaN without any."""
+    lowest = highest = np.pad(height, AROUND, constant_values=np.nan)
+    for axis in (0, 1):
+        lowest, highest = (
+            reduced(sliding_window_view(ends, 2 * AROUND + 1, axis), axis=-1)
+            for reduced, ends in ((np.fmin.reduce, lowest), (np.fmax.reduce, highest))
+        )
+    return np.asarray(highest - lowest)
 
 
 def least_number(coverage: float) -> int:
@@ -8,28 +45,28 @@ def least_number(coverage: float) -> int:
     return int(np.ceil(max(30, 10 / (1 - coverage)) - 1e-9))
 
 
-def margins(scores: np.ndarray, classes: np.ndarray, count: int, coverage: float) -> np.ndarray:
-    """Return the margin of each class: ``(count,)``. Each class has at least `least_number` values.
+def limits_between(values: np.ndarray, most: int, least: float) -> np.ndarray:
+    """Return limits of at most so many classes of values: about as many in each, at least ``least``."""
+    for count in range(most, 1, -1):
+        # between centimetres, so that rounding does not part equal values
+        limits = np.unique(np.round(np.round(np.quantile(values, np.arange(1, count) / count), 2) + 0.005, 3))
+        limits = limits[limits < values.max()]
+        if np.bincount(np.searchsorted(limits, values, side="right"), minlength=limits.size + 1).min() >= least:
+            return np.asarray(limits)
+    return np.empty(0)
+
+
+def margin_of(scores: np.ndarray, coverage: float) -> float:
+    """Return the margin with which a share of the truths is inside, once both bounds are moved outwards by it.
 
     scores: ``(n,)``: how far a truth is outside its interval, negative inside: ``max(lower - truth, truth - upper)``.
-    classes: ``(n,)`` from 0 to ``count - 1``.
-    coverage: share of the truths to be inside, once both bounds are moved outwards by the margin of their class.
     """
-    found = np.empty(count)
-    for kind in range(count):
-        own = scores[classes == kind]
-        rank = int(np.ceil((own.size + 1) * coverage - 1e-9)) - 1
-        found[kind] = np.partition(own, rank)[rank]
-    return found
+    rank = int(np.ceil((scores.size + 1) * coverage - 1e-9)) - 1
+    return float(np.partition(scores, rank)[rank])
 
 
 def widened(
-    height: np.ndarray, lower: np.ndarray, upper: np.ndarray, limits: np.ndarray, margin: np.ndarray
+    height: np.ndarray, lower: np.ndarray, upper: np.ndarray, margin: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Move both bounds outwards by the margin of their class, or inwards by a negative one, never past the height.
-
-    height, lower, upper: of any shape, NaN bounds without an interval.
-    limits, margin: ``(classes - 1,)`` widths between the classes, ``(classes,)`` margins.
-    """
-    own = margin[np.searchsorted(limits, upper - lower, side="right")]
-    return np.minimum(lower - own, height), np.maximum(upper + own, height)
+    """Move both bounds outwards by margins, or inwards by negative ones, never past the height; any shape."""
+    return np.minimum(lower - margin, height), np.maximum(upper + margin, height)

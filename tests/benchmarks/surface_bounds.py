@@ -23,7 +23,7 @@ from sat_intervals.evaluate.surface_calibration import fitted, held_out
 from sat_intervals.heights.choices import BOUNDS, SurfaceChoices
 from sat_intervals.heights.dsm import make_surface
 from sat_intervals.heights.geometry import set_geometry
-from sat_intervals.kernels.conformal import widened
+from sat_intervals.kernels.conformal import relief_of, widened
 from sat_intervals.raster import north_up, write_layer
 
 sys.path.append(str(Path(__file__).parents[1]))
@@ -105,12 +105,12 @@ def surface_of(outs, path, cell, bounds, kind, pixel, like=None):
         known = np.isfinite(truth) & np.isfinite(first.read(2))
     row, column = (4 * places // size for places, size in zip(np.nonzero(known), known.shape, strict=True))
     walls = range_[known] > max(2.2 * pixel, cell * PIXEL)
-    return Heights(height, lower, upper, truth).of(known), walls, 4 * row + column
+    return Heights(height, lower, upper, truth, relief_of(height)).of(known), walls, 4 * row + column
 
 
 def figures(sample, walls, pixel):
     """Coverage of all cells, outside walls and near them; median and mean width in pixels."""
-    inside, width = sample.outside <= 0, sample.width / pixel
+    inside, width = sample.outside <= 0, 2 * sample.half_width / pixel
     near = inside[walls].mean() if walls.any() else np.nan
     return inside.mean(), inside[~walls].mean(), near, np.median(width), width.mean()
 
@@ -118,7 +118,7 @@ def figures(sample, walls, pixel):
 def calibrated(sample, others):
     """A sample with the margins of other samples together."""
     fit = fitted(Heights(*(np.concatenate(values) for values in zip(*others, strict=True))), 1.0, 0.9)
-    lower, upper = widened(*sample[:3], fit.limits, fit.margins)
+    lower, upper = widened(*sample[:3], fit.margins.of(sample.half_width, sample.relief))
     return sample._replace(lower=lower, upper=upper)
 
 

@@ -31,27 +31,48 @@ def scene(folder, seed=0, rows=120, columns=150, scale=1.0):
     return model, write_raster(folder / "reference.tif", [truth])
 
 
+def margins_of(calibration):
+    return np.array([kind.margin for kind in calibration.classes])
+
+
 def test_calibrate_surface__widens_narrow_intervals_and_narrows_wide_ones(tmp_path):
     found = calibrate_surface(*scene(tmp_path), "mine", registers=False)
     assert found.coverage == 0.9
     assert found.surface == {
         "CELL": "1 m", "PAIRS": "1", "INTERVAL": "median", "RADIUS": "1 m", "COVERAGE": "0.9"
     }  # fmt: skip
-    narrow, wide = found.classes
-    assert narrow.margin == pytest.approx(1.645 - 0.5, abs=0.05)
-    assert wide.margin == pytest.approx(3 * 1.645 - 20, abs=0.2)
-    assert narrow.cells + wide.cells == 120 * 150
+    assert [kind.half_width_below for kind in found.classes] == [0.505, None] * 4
+    for narrow, wide in zip(found.classes[::2], found.classes[1::2], strict=True):
+        assert narrow.margin == pytest.approx(1.645 - 0.5, abs=0.25)
+        assert wide.margin == pytest.approx(3 * 1.645 - 20, abs=2.5)
+    assert sum(kind.cells for kind in found.classes) == 120 * 150
     before, expected = found.provenance["before"], found.provenance["expected"]
     assert before["coverage"] < 0.6
     assert expected["coverage"] == pytest.approx(0.9, abs=0.01)
     assert expected["lowest"] > 0.85
-    assert expected["mean_width"] < 0.5 * before["mean_width"]
+    assert expected["mean_half_width"] < 0.5 * before["mean_half_width"]
+
+
+def test_calibrate_surface__covers_rough_ground_as_often_as_smooth(tmp_path):
+    # Intervals are alike, errors of a rough half are larger, and so is the range of its heights.
+    random = np.random.default_rng(0)
+    truth = np.full((120, 160), 100.0)
+    truth[:, 80:] += random.normal(0, 2, (120, 80))
+    height = truth + random.normal(0, 0.3, truth.shape) * np.repeat([1, 4], 80)
+    model = write_surface(tmp_path / "dsm.tif", height, height - 1, height + 1, TAGS)
+    reference = write_raster(tmp_path / "reference.tif", [truth])
+    found = calibrate_surface(model, reference, "x", registers=False)
+    smooth, *_, rough = found.classes
+    assert smooth.relief_below < 3
+    assert (smooth.margin, rough.margin) == (pytest.approx(0.49 - 1, abs=0.05), pytest.approx(1.97 - 1, abs=0.15))
 
 
 def test_calibrate_surface__other_coverages(tmp_path):
     files = scene(tmp_path)
-    margins = [calibrate_surface(*files, "x", coverage=level, registers=False).margins[0] for level in (0.5, 0.8, 0.95)]
-    np.testing.assert_allclose(margins, np.array([0.674, 1.282, 1.96]) - 0.5, atol=0.06)
+    margins = [
+        margins_of(calibrate_surface(*files, "x", coverage=level, registers=False)) for level in (0.5, 0.8, 0.95)
+    ]
+    np.testing.assert_allclose([found[::2].mean() for found in margins], np.array([0.674, 1.282, 1.96]) - 0.5, atol=0.1)
 
 
 def test_calibrate_surface__blocks_that_differ_show_in_the_lowest_coverage(tmp_path):
@@ -84,7 +105,7 @@ def test_calibrate_surface__of_a_sample_is_that_of_all_cells(tmp_path, monkeypat
     monkeypatch.setattr("sat_intervals.evaluate.surface_calibration._MOST", 6000)
     part = calibrate_surface(*files, "x", registers=False)
     assert 3000 < sum(kind.cells for kind in part.classes) <= 6000
-    np.testing.assert_allclose(part.margins, whole.margins, atol=0.4)
+    np.testing.assert_allclose(margins_of(part), margins_of(whole), atol=1)
 
 
 def test_calibrate_surface__moves_the_reference_unless_told_not_to(tmp_path):
@@ -97,11 +118,11 @@ def test_calibrate_surface__moves_the_reference_unless_told_not_to(tmp_path):
     moved = calibrate_surface(model, reference, "x")
     assert moved.registered
     assert moved.provenance["shift"][2] == pytest.approx(5, abs=0.1)
-    assert moved.margins[0] < 0
+    assert margins_of(moved).max() < 0
     still = calibrate_surface(model, reference, "x", registers=False)
     assert not still.registered
     assert still.provenance["shift"] is None
-    assert still.margins[0] == pytest.approx(4.4, abs=0.1)
+    assert margins_of(still) == pytest.approx(4.4, abs=0.2)
 
 
 def test_calibrate_surface__cells_in_one_pixel_of_a_coarser_reference_count_as_one(tmp_path):
@@ -202,11 +223,14 @@ def test_load_height_calibration__what_it_cannot_use_is_one_line(tmp_path):
         ({"name": "x", "key": {}, "levels": []}, "is a calibration of disparities: give it to match"),
         ({"preset": "satellite"}, "has settings, not a calibration"),
         ({}, "name: field required"),
-        (given | {"classes": rows[:-1]}, "below is to be null in the last class"),
-        (given | {"classes": [*rows[:-1], *rows]}, "below falls from"),
+        (given | {"classes": rows[:-1]}, "half_width_below is to be null in the last class"),
+        (given | {"classes": [*rows, rows[0] | {"half_width_below": None}]}, "relief_below is to be null in the last"),
+        (given | {"classes": [rows[1], *rows]}, "half_width_below is to be null in the last class"),
+        (given | {"classes": [rows[0], *rows]}, "half_width_below falls from 0.505 to 0.505"),
+        ({key: given[key] for key in given if key != "version"}, "is of an earlier version, with margins by width"),
         (given | {"classes": [rows[-1] | {"margin": "1 m"}]}, "classes.0.margin: input should be a valid number"),
         (given | {"coverage": 1.0}, "coverage: input should be less than 1"),
-        ([1], "holds [1], allowed: keys name, coverage"),
+        ([1], "holds [1], allowed: keys version, name, coverage"),
     ):
         file.write_text(yaml.safe_dump(content))
         with pytest.raises(SatIntervalsError) as error:

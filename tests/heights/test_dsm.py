@@ -198,12 +198,15 @@ def test_make_surface__does_not_depend_on_its_tiles(tmp_path, monkeypatch):
     random = np.random.default_rng(2)
     x, y = random.uniform(0, 40, (2, 12, 12))
     out = write_points(tmp_path / "a", x, -y, random.normal(100, 5, x.shape))
-    whole, place, _ = surface_of([out], tmp_path)
+    (tmp_path / "heights.yaml").write_text(CALIBRATION.replace("0.6 m", "1 m"))
+    choices = SurfaceChoices(calibration=load_height_calibration(tmp_path / "heights.yaml"))
+    whole, place, _ = surface_of([with_coverage(out)], tmp_path, choices=choices)
+    assert np.unique(np.round(whole[2] - whole[0], 2)).size > 3  # margins of all classes
     monkeypatch.setattr("sat_intervals.heights.lattice.WINDOW", 7)
     monkeypatch.setattr("sat_intervals.heights.point_cloud.WINDOW", 5)
     monkeypatch.setattr("sat_intervals.heights.cells._TILE", 20)
     monkeypatch.setattr("sat_intervals.heights.cells._LOWEST", 1)
-    tiled, same_place, _ = surface_of([out], tmp_path)
+    tiled, same_place, _ = surface_of([out], tmp_path, choices=choices)
     assert place == same_place
     assert_allclose(tiled, whole, atol=1e-4)
     assert_array_equal(tiled[3], whole[3])
@@ -285,13 +288,15 @@ def test_make_surface__poor_cells_are_no_data(tmp_path):
 
 
 CALIBRATION = """\
+version: 2
 name: city
 coverage: 0.8
 registered: true
 surface: {CELL: 1 m, PAIRS: '1', INTERVAL: median, RADIUS: 0.6 m, COVERAGE: '0.9', OPEN_POINTS: left out}
 classes:
-- {below: 5.0, margin: 0.75, cells: 100}
-- {below: null, margin: -4.0, cells: 100}
+- {relief_below: 5.0, half_width_below: 2.5, margin: 0.75, cells: 100}
+- {relief_below: 5.0, half_width_below: null, margin: -4.0, cells: 100}
+- {relief_below: null, half_width_below: null, margin: 1.0, cells: 100}
 """
 
 
