@@ -38,7 +38,7 @@ _BIAS = 0.25
 @surface_options(
     "Evaluate this surface model against --reference, instead of runs.",
     "runs and pairs",
-    *("classes", "pictures", "line", "overwrite"),
+    *("classes", "within", "pictures", "line", "overwrite"),
 )
 @details_options
 @settings_options
@@ -68,9 +68,11 @@ def evaluate(
     file.
 
     For a surface model (--dsm), prints bias, median, NMAD (1.4826 times the median distance from the median), RMSE and
-    LE90 of height - reference, the share of reference heights inside the cells' intervals and the half widths, by slope
-    of the reference, by width of the interval and by --classes. The reference is first moved by its constant shift from
-    the surface; figures of all cells are printed before and after that.
+    LE90 of height - reference, the share of reference heights inside the cells' intervals, the half widths, and
+    completeness (shares of the reference heights that have a height, and one --within so many metres), by slope of the
+    reference, by half width of the interval and by --classes; and how well half widths rank errors (AUSE). The
+    reference is first moved by its constant shift from the surface; figures of all cells are printed before and after
+    that.
     """
     if surface:
         evaluate_heights(surface, details, printing)

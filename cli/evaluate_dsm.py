@@ -17,6 +17,7 @@ class Details:
     """What is evaluated of a surface model beside all cells, and the folder for pictures, which is made."""
 
     classes: Path | None
+    within: float | None
     pictures: Path | None
     line: tuple[float, float, float, float] | None
     overwrite: bool
@@ -60,6 +61,12 @@ details_options = gathered(
     Details,
     click.option("--classes", type=FILE, help="With --dsm: raster of whole numbers, such as land cover, in any CRS."),
     click.option(
+        "--within",
+        type=float,
+        metavar="METRES",
+        help="With --dsm: errors up to this count as found in the completeness; default 1.",
+    ),
+    click.option(
         "--pictures", type=FILE, metavar="FOLDER", help="With --dsm: write figures (JSON, Markdown) and pictures there."
     ),
     click.option(
@@ -80,7 +87,8 @@ def evaluate_heights(surface: Surface, details: Details, printing: Printing) -> 
 
     if details.pictures:
         details.check_folder(details.pictures, surface)
-    report = evaluate_surface(surface.dsm, surface.reference, details.classes, registers=surface.registers)
+    within = {} if details.within is None else {"within": details.within}
+    report = evaluate_surface(surface.dsm, surface.reference, details.classes, registers=surface.registers, **within)
     printing.say(report)
     if not printing.as_json:
         show_surface(str(surface.dsm), report)

@@ -100,8 +100,10 @@ def show_scene(scene: SceneMetrics) -> None:
 # Columns of the figures of a surface model: key, and heading.
 _ACCURACY = {
     "count": "cells", "bias": "bias (m)", "median": "median (m)", "nmad": "NMAD (m)", "rmse": "RMSE (m)",
-    "le90": "LE90 (m)", "p95_p5": "P95-P5 (m)", "coverage": "coverage", "mean_half_width": "mean half width (m)",
+    "le90": "LE90 (m)", "p95_p5": "P95-P5 (m)", "coverage": "coverage",
+    "coverage_deviation": "standard error", "mean_half_width": "mean half width (m)",
     "median_half_width": "median half width (m)", "interval_score": "interval score (m)",
+    "completeness": "with height", "within": "within {within:g} m",
 }  # fmt: skip
 
 
@@ -134,14 +136,28 @@ def _surface_table(report: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
             named.append((label.format(ends), kind))
     named += [(f"class {kind['class']}", kind) for kind in report["classes"]]
     keys = list(_ACCURACY)[1:]
-    return ["", *_ACCURACY.values()], [[label, *_measures(kind, *keys)] for label, kind in named]
+    header = ["", *(name.format(**report) for name in _ACCURACY.values())]
+    return header, [[label, *_measures(kind, *keys)] for label, kind in named]
 
 
 def _notes(report: dict[str, Any]) -> list[str]:
     return [
         "errors are height - reference; bias is their mean; LE90: 90 % of the absolute errors are not larger",
+        "with height, within: shares of the reference heights that have a height, and one with an error up to that",
         _nominal_line(report),
+        *_ranking_lines(report["ranking"]),
         *report["warnings"],
+    ]
+
+
+def _ranking_lines(ranking: dict[str, float | None]) -> list[str]:
+    """Return a line that says how well half widths rank errors."""
+    if ranking["half_width"] is None:
+        return []
+    return [
+        f"AUSE of half widths {ranking['half_width']:.3f}, of the range of heights in 5 x 5 cells alone "
+        f"{ranking['relief']:.3f}: how far the error of what is left, as the most doubtful cells go, is above the "
+        "least possible, in mean errors; 0: widths rank cells as errors do"
     ]
 
 

@@ -12,15 +12,17 @@ import numpy as np
 from sat_intervals.evaluate.metrics import Intervals, share
 from sat_intervals.match.histogram import Histogram
 
+BLOCKS = 4  # parts of the ground along each of its sides: errors within one are correlated
 LARGEST = 500  # errors and widths are counted up to this many metres
 # Factor of the NMAD, a robust standard deviation: sigma of a normal distribution (Hoehle and Hoehle 2009).
 _NORMAL = 1.4826
+_RANKED = 500  # steps a metre in which values are ranked
 
 
 class Heights(NamedTuple):
     """Heights of cells, their bounds, reference heights and relief, see `relief_of`: ``(n,)`` metres.
 
-    Bounds are NaN without an interval.
+    Bounds are NaN without an interval. ``block`` is the part of the ground, see `Comparison.block_of`.
     """
 
     height: np.ndarray
@@ -28,6 +30,7 @@ class Heights(NamedTuple):
     upper: np.ndarray
     reference: np.ndarray
     relief: np.ndarray
+    block: np.ndarray
 
     @property
     def half_width(self) -> np.ndarray:
@@ -45,23 +48,31 @@ class Heights(NamedTuple):
 
 
 class Accuracy:
-    """Figures of a class of cells; ``nominal`` is the coverage that intervals are to reach, None if unknown."""
+    """Figures of a class of cells; ``nominal`` is the coverage that intervals are to reach, None if unknown.
 
-    def __init__(self, nominal: float | None) -> None:
-        self._nominal = nominal
-        self._count = 0
+    ``within``: metres of error up to which a height counts as found.
+    """
+
+    def __init__(self, nominal: float | None, within: float) -> None:
+        self._nominal, self._within = nominal, within
+        self._count = self._missing = self._near = 0
+        self._blocks = np.zeros((2, BLOCKS**2))  # intervals, and those that contain their reference
         self._sum = self._squares = 0.0
         self._errors, self._intervals = Histogram(-LARGEST, LARGEST, 1000), Intervals(LARGEST, nominal)
 
-    def add(self, cells: Heights) -> None:
-        """Add cells."""
+    def add(self, cells: Heights, missing: int) -> None:
+        """Add cells, and a number of reference heights whose cells have no height."""
         error = cells.height - cells.reference
         self._count += error.size
+        self._missing += missing
+        self._near += int((np.abs(error) <= self._within).sum())
         self._sum += float(error.sum())
         self._squares += float(np.square(error).sum())
         self._errors.add(error)
         bounded = cells.of(np.isfinite(cells.half_width))
         self._intervals.add(np.maximum(bounded.outside, 0), 2 * bounded.half_width)
+        for total, blocks in zip(self._blocks, (bounded.block, bounded.block[bounded.outside <= 0]), strict=True):
+            total += np.bincount(blocks, minlength=total.size)
 
     def report(self) -> dict[str, Any]:
         """Return all figures, None without cells: metres, and shares of cells with an interval."""
@@ -72,6 +83,8 @@ class Accuracy:
         }
         return {
             "count": self._count,
+            "completeness": share(self._count, self._count + self._missing),
+            "within": share(self._near, self._count + self._missing),
             "bias": share(self._sum, self._count),
             "median": self._errors.median(),
             "nmad": None if deviation is None else _NORMAL * deviation,
@@ -80,8 +93,55 @@ class Accuracy:
             "p95_p5": None if low is None or high is None else high - low,
             "with_interval": intervals["count"],
             "coverage": intervals["accuracy"],
+            "coverage_deviation": coverage_deviation(*self._blocks),
             "mean_half_width": halves["mean"],
             "median_half_width": halves["median"],
             "interval_score": intervals["interval_score"],
             "needed_half_width": None if self._nominal is None else self._errors.quantile_of_absolutes(self._nominal),
         }
+
+
+def coverage_deviation(counts: np.ndarray, inside: np.ndarray) -> float | None:
+    """Return the standard error of a coverage: by what differs between blocks, at least that of a binomial share."""
+    counts, inside = counts[counts > 0], inside[counts > 0]
+    if not counts.size:
+        return None
+    coverage = inside.sum() / counts.sum()
+    variance = coverage * (1 - coverage) / counts.sum()
+    if counts.size > 1:
+        between = np.square(inside - coverage * counts).sum() / counts.sum() ** 2
+        variance = max(variance, between * counts.size / (counts.size - 1))
+    return float(np.sqrt(variance))
+
+
+class Ranking:
+    """How well widths, and relief alone, rank errors: areas under sparsification error curves (AUSE)."""
+
+    # The curve: mean absolute error of the share of cells that is left, from those of the smallest value on, in units
+    # of the mean of all. Its area, less that of the curve by the errors themselves, is 0 for a perfect ranking.
+
+    def __init__(self) -> None:
+        self._sums = np.zeros((3, 2, LARGEST * _RANKED + 1))
+
+    def add(self, cells: Heights) -> None:
+        """Add cells; those without an interval do not count."""
+        cells = cells.of(np.isfinite(cells.half_width))
+        error = np.abs(cells.height - cells.reference)
+        for sums, values in zip(self._sums, (error, cells.half_width, cells.relief), strict=True):
+            place = np.clip(np.rint(values * _RANKED), 0, sums.shape[1] - 1).astype(np.int64)
+            for total, weights in zip(sums, (None, error), strict=True):
+                total += np.bincount(place, weights, total.size)
+
+    def report(self) -> dict[str, float | None]:
+        """Return the areas of half widths and of relief; None without errors."""
+        if not self._sums[0, 1].sum():
+            return {"half_width": None, "relief": None}
+        best, half_width, relief = map(_area, self._sums)
+        return {"half_width": half_width - best, "relief": relief - best}
+
+
+def _area(sums: np.ndarray) -> float:
+    """Return the area under a curve, from numbers of cells and sums of their errors by rising value."""
+    counts, errors = np.cumsum(sums[:, sums[0] > 0], axis=1)
+    kept, mean = counts / counts[-1], errors / counts * counts[-1] / errors[-1]
+    return float(mean[0] * kept[0] + np.trapezoid(mean, kept))

@@ -3,16 +3,16 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.evaluate.accuracy import LARGEST, Heights
+from sat_intervals.evaluate.accuracy import BLOCKS, LARGEST, Heights
 from sat_intervals.kernels.conformal import AROUND, relief_of
 from sat_intervals.kernels.registration import REACH, every_nth, put_together, register, spread_blocks
 from sat_intervals.kernels.relief import sampled
-from sat_intervals.raster import GROUND, Georeferencing, read_heights, read_layers, read_place, surface_place
+from sat_intervals.raster import GROUND, Georeferencing, read_heights, read_layers, read_place, read_tags, surface_place
 from sat_intervals.raster.heightfield import warn_of_no_data
 from sat_intervals.raster.surfaces import check_reference, covered_window, datum_warnings, resolution_of
 from sat_intervals.tiling import Grid, Window
@@ -32,6 +32,7 @@ class Comparison:
     place: Georeferencing
     resolution: float  # of the reference in metres
     finer: int  # heights of the reference along a cell
+    area: Window  # cells where the reference may have heights
     registration: dict[str, Any] | None = None
 
     @property
@@ -43,6 +44,17 @@ class Comparison:
     def cell(self) -> float:
         """Return the side of a cell in metres."""
         return self.place.pixel_size[0]
+
+    def block_of(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+        """Return the part of the ground of cells: `BLOCKS` x `BLOCKS` parts of the area of the reference."""
+        parts = (
+            np.clip(BLOCKS * (place - first) // max(1, size), 0, BLOCKS - 1)
+            for place, first, size in (
+                (row, self.area.row, self.area.height),
+                (column, self.area.column, self.area.width),
+            )
+        )
+        return np.asarray(next(parts) * BLOCKS + next(parts))
 
     def cells(self, window: Window, finer: int = 1) -> tuple[Georeferencing, tuple[int, int]]:
         """Return place and shape of a window of cells, perhaps beyond the surface, with ``finer`` per side of each."""
@@ -93,7 +105,8 @@ def open_comparison(
     warn_of_no_data(reference)
     resolution = resolution_of(reference, place)
     finer = max(1, round(place.pixel_size[0] / resolution))
-    return Comparison(surface, reference, shape, place, resolution, finer, registration)
+    area = covered_window(reference, place, shape)
+    return Comparison(surface, reference, shape, place, resolution, finer, area, registration)
 
 
 def check_common(given: Comparison, count: int, median: float | None) -> list[str]:
@@ -110,21 +123,45 @@ def check_common(given: Comparison, count: int, median: float | None) -> list[st
     return datum_warnings(given.surface, given.reference, median)
 
 
+def shared_errors(given: Comparison) -> list[str]:
+    """Return a warning if the reference is a surface of this tool, too."""
+    if "RUNS" not in read_tags(given.reference):
+        return []
+    return [
+        f"{given.reference} is a surface of this tool, too: errors that both share do not show, so coverage is too "
+        "large and margins are too small; compare with heights of another source"
+    ]
+
+
 def tiles(given: Comparison) -> Iterator[Window]:
     """Yield square tiles: windows of whole rows would read the blocks of a fine reference many times."""
     side = max(1, int(_TILE**0.5) // given.finer)
     return (tile.core for tile in Grid(Window(0, 0, *given.shape), side))
 
 
-def compared(given: Comparison, window: Window) -> tuple[Heights, np.ndarray]:
-    """Read the cells of a tile that both have a height, once for each reference height; and the mask of these."""
+class Compared(NamedTuple):
+    """Heights of both, and where they are among the reference heights of a tile: mask or rows and columns.
+
+    ``missing``: where reference heights are whose cells have none.
+    """
+
+    cells: Heights
+    known: Any
+    missing: Any
+
+
+def compared(given: Comparison, window: Window) -> Compared:
+    """Read the cells of a tile that both have a height, once for each reference height."""
     finer = given.finer
     height, lower, upper, relief = (
         np.repeat(np.repeat(band, finer, axis=0), finer, axis=1) for band in _bands(given, window)
     )
     reference = given.heights(*given.cells(window, finer), needed=np.isfinite(height))
     known = np.isfinite(reference) & np.isfinite(height)
-    return Heights(height, lower, upper, reference, relief).of(known), known
+    row, column = np.arange(height.shape[0])[:, np.newaxis] // finer, np.arange(height.shape[1]) // finer
+    block = given.block_of(row + window.row, column + window.column)
+    cells = Heights(height, lower, upper, reference, relief, block).of(known)
+    return Compared(cells, known, np.isfinite(reference) & np.isnan(height))
 
 
 def _bands(given: Comparison, window: Window) -> np.ndarray:
@@ -137,7 +174,7 @@ def _bands(given: Comparison, window: Window) -> np.ndarray:
 def registered(given: Comparison) -> tuple[Comparison, list[str]]:
     """Return the comparison with the reference moved to the surface; the same and a warning with too few heights."""
     parts = []
-    for core in spread_blocks(covered_window(given.reference, given.place, given.shape), _SMALLEST):
+    for core in spread_blocks(given.area, _SMALLEST):
         height = read_layers(given.surface, core)[0].astype(np.float64)
         row, column = np.nonzero(np.isfinite(height))
         if row.size:

@@ -1,6 +1,5 @@
 """Evaluate a surface model and its intervals against reference heights, tile by tile."""
 
-from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -8,8 +7,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.evaluate.accuracy import Accuracy, Heights
-from sat_intervals.evaluate.comparison import Comparison, check_common, compared, open_comparison, registered, tiles
+from sat_intervals.evaluate.accuracy import Accuracy, Heights, Ranking
+from sat_intervals.evaluate.comparison import (
+    Comparison,
+    check_common,
+    compared,
+    open_comparison,
+    registered,
+    shared_errors,
+    tiles,
+)
 from sat_intervals.raster import read_heights, read_layers, read_place, read_small_layers, read_tags
 from sat_intervals.tiling import Window
 
@@ -25,12 +32,13 @@ _SAMPLES, _AT_ONCE = 4000, 256  # samples of a profile, and of those read at a t
 class _Ranges:
     """Figures by ranges of a value between limits."""
 
-    def __init__(self, limits: tuple[float, ...], nominal: float | None) -> None:
-        self._kinds = {ends: Accuracy(nominal) for ends in pairwise(limits)}
+    def __init__(self, limits: tuple[float, ...], *judging: Any) -> None:
+        self._kinds = {ends: Accuracy(*judging) for ends in pairwise(limits)}
 
-    def add(self, cells: Heights, values: np.ndarray) -> None:
+    def add(self, cells: Heights, values: np.ndarray, of_missing: np.ndarray) -> None:
         for (first, last), kind in self._kinds.items():
-            kind.add(cells.of((first <= values) & (values < last)))
+            chosen, missing = ((first <= part) & (part < last) for part in (values, of_missing))
+            kind.add(cells.of(chosen), int(missing.sum()))
 
     def report(self) -> list[dict[str, Any]]:
         return [
@@ -39,8 +47,49 @@ class _Ranges:
         ]
 
 
+class _Figures:
+    """Figures of all cells and of classes; ``judging``: what `Accuracy` takes."""
+
+    def __init__(self, *judging: Any) -> None:
+        self._judging = judging
+        self._whole, self._ranking = Accuracy(*judging), Ranking()
+        self._slopes, self._halves = _Ranges(SLOPES, *judging), _Ranges(HALF_WIDTHS, *judging)
+        self._classes: dict[int, Accuracy] = {}
+
+    def add(self, given: Comparison, window: Window, classes: Path | None) -> None:
+        """Add the cells of a tile."""
+        cells, known, missing = compared(given, window)
+        self._whole.add(cells, int(missing.sum()))
+        self._ranking.add(cells)
+        slope = _slope(given, window)
+        self._slopes.add(cells, slope[known], slope[missing])
+        self._halves.add(cells, cells.half_width, np.empty(0))
+        if classes is not None:
+            values = _classes(given, classes, window)
+            found, absent = values[known], values[missing]
+            either = np.concatenate([found, absent])
+            for number in np.unique(either[np.isfinite(either)]):
+                kind = self._classes.setdefault(int(number), Accuracy(*self._judging))
+                kind.add(cells.of(found == number), int((absent == number).sum()))
+
+    def report(self) -> dict[str, Any]:
+        """Return the figures, see `evaluate_surface`."""
+        return {
+            "all": self._whole.report(),
+            "slope": self._slopes.report(),
+            "half_width": [kind | {"completeness": None, "within": None} for kind in self._halves.report()],
+            "classes": [{"class": number, **self._classes[number].report()} for number in sorted(self._classes)],
+            "ranking": self._ranking.report(),
+        }
+
+
 def evaluate_surface(
-    surface: str | Path, reference: str | Path, classes: str | Path | None = None, *, registers: bool = True
+    surface: str | Path,
+    reference: str | Path,
+    classes: str | Path | None = None,
+    *,
+    registers: bool = True,
+    within: float = 1.0,
 ) -> dict[str, Any]:
     """Evaluate the heights and intervals of a surface model against reference heights.
 
@@ -56,13 +105,16 @@ def evaluate_surface(
         Raster of whole numbers, such as land cover, in any CRS.
     registers
         Whether the reference is first moved by its constant shift from the surface.
+    within
+        Metres of error up to which a height counts as found.
 
     Returns
     -------
     Figures of `Accuracy.report` (metres, shares) for ``all`` heights, ``before`` registration, by ``slope`` of the
-    reference (degrees), ``half_width`` of the interval (metres) and ``classes``; ``registration``, see
-    `Registration.report`; ``nominal``, the level of the intervals, and what it is (``nominal_is``): ``coverage``,
-    ``alpha``, or None; ``warnings``, lines.
+    reference (degrees), ``half_width`` of the interval (metres) and ``classes``; ``ranking``, how well ``half_width``
+    ranks errors, and ``relief``, the range of heights in 5 x 5 cells, alone: the area under the sparsification error
+    curve, 0 is perfect; ``within``; ``registration``, see `Registration.report`; ``nominal``, the level of the
+    intervals, and what it is (``nominal_is``): ``coverage``, ``alpha``, or None; ``warnings``, lines.
 
     Raises
     ------
@@ -76,23 +128,16 @@ def evaluate_surface(
     if classes is not None:
         read_place(Path(classes))
     moved, warnings = registered(given) if registers else (given, [])
-    before, whole = Accuracy(nominal), Accuracy(nominal)
-    slopes, halves = _Ranges(SLOPES, nominal), _Ranges(HALF_WIDTHS, nominal)
-    kinds: dict[int, Accuracy] = {}
+    before, figures = Accuracy(nominal, within), _Figures(nominal, within)
     for window in tiles(given):
-        cells, known = compared(moved, window)
-        whole.add(cells)
-        slopes.add(cells, _slope(moved, window)[known])
-        halves.add(cells, cells.half_width)
-        if classes is not None:
-            for number, chosen in _classes(given, Path(classes), window, known):
-                kinds.setdefault(number, Accuracy(nominal)).add(cells.of(chosen))
+        figures.add(moved, window, None if classes is None else Path(classes))
         if moved is not given:
-            before.add(compared(given, window)[0])
-    report = whole.report()
-    in_place = before.report() if moved is not given else report
-    warnings += check_common(given, in_place["count"], in_place["median"])
-    coverage = report["coverage"]
+            cells, _, missing = compared(given, window)
+            before.add(cells, int(missing.sum()))
+    report = figures.report()
+    in_place = before.report() if moved is not given else report["all"]
+    warnings += shared_errors(given) + check_common(given, in_place["count"], in_place["median"])
+    coverage = report["all"]["coverage"]
     if nominal and coverage is not None and coverage < _POOR * nominal:
         warnings.append(
             f"the intervals contain {100 * coverage:.0f} % of the reference heights, where {100 * nominal:.0f} % are "
@@ -102,12 +147,10 @@ def evaluate_surface(
         "nominal": nominal,
         "nominal_is": nominal_is,
         "registration": moved.registration,
+        "within": within,
         "warnings": warnings,
         "before": in_place,
-        "all": report,
-        "slope": slopes.report(),
-        "half_width": halves.report(),
-        "classes": [{"class": number, **kinds[number].report()} for number in sorted(kinds)],
+        **report,
     }
 
 
@@ -125,17 +168,17 @@ def _slope(given: Comparison, window: Window) -> np.ndarray:
     return np.asarray(np.degrees(np.arctan(np.hypot(across, down))))
 
 
-def _classes(given: Comparison, path: Path, window: Window, known: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield the classes of the heights of a tile, each with the mask of its heights."""
+def _classes(given: Comparison, path: Path, window: Window) -> np.ndarray:
+    """Return the classes of the reference heights of a tile, NaN where unknown."""
     place, shape = given.cells(window, given.finer)
-    values = read_heights(path, place, shape, Window(0, 0, *shape))[known]
+    values = read_heights(path, place, shape, Window(0, 0, *shape))
     found = np.unique(values[np.isfinite(values)])
     if (found % 1).any() or found.size > _MOST_CLASSES:
         raise SatIntervalsError(
             f"{path} has values such as {found[(found % 1).argmax()]:g}, or more than {_MOST_CLASSES} of them: give a "
             "raster of classes"
         )
-    yield from ((int(value), values == value) for value in found)
+    return values
 
 
 class Profile(NamedTuple):

@@ -15,13 +15,20 @@ from sat_intervals.config import HeightCalibration, HeightClass, surface_key
 from sat_intervals.config.calibration import COVERAGES
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.accuracy import Heights
-from sat_intervals.evaluate.comparison import Comparison, check_common, compared, open_comparison, registered, tiles
+from sat_intervals.evaluate.comparison import (
+    Comparison,
+    check_common,
+    compared,
+    open_comparison,
+    registered,
+    shared_errors,
+    tiles,
+)
 from sat_intervals.kernels.conformal import Margins, least_number, limits_between, margin_of, widened
 from sat_intervals.raster import read_tags
 
 _MOST = 1 << 20  # heights that are used: a sample, if there are more
-# Classes of relief, and of half width in each, fewer with few cells; blocks along each side of the ground.
-_CLASSES, _BLOCKS = 4, 4
+_CLASSES = 4  # of relief, and of half width in each, fewer with few cells
 
 
 class Fit(NamedTuple):
@@ -73,10 +80,9 @@ def calibrate_surface(
     coverage = _checked_coverage(given.surface, tags, coverage)
     moved, warnings = registered(given) if registers else (given, [])
     is_moved = moved.registration is not None
-    sample, block, cells_of_height = _sample(moved)
-    warnings += _datum_warnings(moved, sample)
-    bounded = np.isfinite(sample.half_width)
-    sample, block = sample.of(bounded), block[bounded]
+    sample, cells_of_height = _sample(moved)
+    warnings += shared_errors(given) + _datum_warnings(moved, sample)
+    sample = sample.of(np.isfinite(sample.half_width))
     fit = fitted(sample, cells_of_height, coverage)
     if fit is None:
         once = f" (those in a pixel of {given.resolution:.3g} m count as one)" if _coarser(given) > 1 else ""
@@ -91,7 +97,7 @@ def calibrate_surface(
         "reference": str(given.reference),
         "shift": [round(value, 3) for value in moved.shift] if is_moved else None,
         "before": _figures(sample),
-        "expected": _expected(sample, block, cells_of_height, coverage),
+        "expected": _expected(sample, cells_of_height, coverage),
         "warnings": warnings,
     }
     return HeightCalibration(
@@ -122,36 +128,25 @@ def _coarser(given: Comparison) -> float:
     return max(1.0, round(given.resolution / given.cell, 3))
 
 
-def _sample(given: Comparison) -> tuple[Heights, np.ndarray, float]:
-    """Return heights, `_MOST` at most by chance, the block of ground of each, and the cells that one stands for."""
+def _sample(given: Comparison) -> tuple[Heights, float]:
+    """Return heights, `_MOST` at most by chance, and the cells that one stands for."""
     random = np.random.default_rng(0)
-    parts = [np.empty((7, 0))]
+    parts = [np.empty((len(Heights._fields), 0))]
     common = 0
     gathered = 0
     share = 1.0
     for window in tiles(given):
-        cells, known = compared(given, window)
-        row, column = (place // given.finer for place in np.nonzero(known))
-        values = np.stack([*cells, row + window.row, column + window.column])
-        common += row.size
-        parts.append(values[:, random.random(row.size) < share])
+        values = np.stack(compared(given, window).cells)
+        common += values.shape[1]
+        parts.append(values[:, random.random(values.shape[1]) < share])
         gathered += parts[-1].shape[1]
         while gathered > _MOST:
             share /= 2
             parts = [part[:, random.random(part.shape[1]) < 0.5] for part in parts]
             gathered = sum(part.shape[1] for part in parts)
-    *heights, row, column = np.concatenate(parts, axis=1)
+    sample = Heights(*np.concatenate(parts, axis=1))
     cells_of_all = common / (given.finer * _coarser(given)) ** 2
-    block = _BLOCKS * _part(row) + _part(column)
-    return Heights(*heights), block, min(1.0, cells_of_all / max(1, block.size))
-
-
-def _part(place: np.ndarray) -> np.ndarray:
-    """Return in which of `_BLOCKS` parts of their range numbers are."""
-    if not place.size:
-        return place
-    first, count = int(place.min()), int(np.ptp(place)) + 1
-    return np.asarray(_BLOCKS * (place - first) // count)
+    return sample, min(1.0, cells_of_all / max(1, sample.height.size))
 
 
 def _datum_warnings(given: Comparison, sample: Heights) -> list[str]:
@@ -180,10 +175,10 @@ def fitted(sample: Heights, cells_of_height: float, coverage: float) -> Fit | No
     return Fit(Margins(relief, tuple(limits), tuple(margins)), tuple(cells))
 
 
-def held_out(sample: Heights, block: np.ndarray, cells_of_height: float, coverage: float) -> Heights | None:
+def held_out(sample: Heights, cells_of_height: float, coverage: float) -> Heights | None:
     """Return the sample with margins of the other blocks of ground; None if the others have too few cells."""
-    lower, upper = np.full((2, block.size), np.nan)
-    for own in (block == number for number in np.unique(block)):
+    lower, upper = np.full((2, sample.height.size), np.nan)
+    for own in (sample.block == number for number in np.unique(sample.block)):
         fit = fitted(sample.of(~own), cells_of_height, coverage)
         if fit is None:
             return None
@@ -192,14 +187,12 @@ def held_out(sample: Heights, block: np.ndarray, cells_of_height: float, coverag
     return sample._replace(lower=lower, upper=upper)
 
 
-def _expected(
-    sample: Heights, block: np.ndarray, cells_of_height: float, coverage: float
-) -> dict[str, float | None] | None:
+def _expected(sample: Heights, cells_of_height: float, coverage: float) -> dict[str, float | None] | None:
     """Return figures of intervals that were held out, and the smallest coverage of a block with enough cells."""
-    found = held_out(sample, block, cells_of_height, coverage)
+    found = held_out(sample, cells_of_height, coverage)
     if found is None:
         return None
-    blocks = [found.outside[block == number] <= 0 for number in np.unique(block)]
+    blocks = [found.outside[found.block == number] <= 0 for number in np.unique(found.block)]
     of_blocks = [float(inside.mean()) for inside in blocks if inside.size * cells_of_height >= least_number(coverage)]
     return _figures(found) | {"lowest": round(min(of_blocks), 4) if of_blocks else None}
 

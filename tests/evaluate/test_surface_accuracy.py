@@ -55,6 +55,54 @@ def test_evaluate_surface__worked_example(tmp_path):
     assert scored["all"]["needed_half_width"] == everything["le90"]
 
 
+def test_evaluate_surface__completeness_counts_reference_heights_without_a_height(tmp_path):
+    # Ten reference heights: two without a height, one of them on the slope; errors of .4 three times, of 3 twice.
+    reference = np.array([[5.0, 5, 5, 5, 5, 5, 5, 5, 7, 9]])
+    height = np.array([[np.nan, 5.4, 5.4, 5.4, 8, 8, 5, 5, 7, np.nan]])
+    model = write_surface(tmp_path / "dsm.tif", height, height - 1, height + 1)
+    truth = write_raster(tmp_path / "reference.tif", [reference])
+    classes = write_raster(tmp_path / "classes.tif", [np.array([[7.0, 7, 1, 1, 1, 1, 1, 1, 1, 1]])])
+    report = evaluate_surface(model, truth, classes, registers=False)
+    assert (report["all"]["completeness"], report["all"]["within"]) == (0.8, 0.6)
+    flat, *_, steep = (kind for kind in report["slope"] if kind["count"])
+    assert (flat["completeness"], flat["within"]) == (pytest.approx(6 / 7), pytest.approx(4 / 7))
+    assert steep["completeness"] == pytest.approx(2 / 3)
+    assert [kind["completeness"] for kind in report["classes"]] == [7 / 8, 1 / 2]
+    assert all(kind["completeness"] is None for kind in report["half_width"])
+    assert evaluate_surface(model, truth, registers=False, within=0.1)["all"]["within"] == pytest.approx(0.3)
+
+
+def test_evaluate_surface__standard_error_of_the_coverage_is_that_between_blocks(tmp_path):
+    # Of 16 blocks of 100 cells 8 are inside and 8 outside: as uncertain as 16 coins, not as 1600.
+    height = np.kron(np.indices((4, 4)).sum(axis=0) % 2, np.ones((10, 10))) * 9.0
+    model = write_surface(tmp_path / "dsm.tif", height, height - 1, height + 1)
+    report = evaluate_surface(model, write_raster(tmp_path / "reference.tif", [0 * height]), registers=False)["all"]
+    assert (report["coverage"], report["coverage_deviation"]) == (0.5, pytest.approx(0.5 / np.sqrt(15)))
+
+
+def test_evaluate_surface__ranking_is_the_area_between_sparsification_curves(tmp_path):
+    # Errors 4 3 2 1; half widths rank them as 3 4 1 2 do, relief, over all cells, is the same everywhere.
+    reference, error = np.zeros((1, 4)), np.array([[4.0, 3, 2, 1]])
+    half = np.array([[3.0, 4, 1, 2]])
+    model = write_surface(tmp_path / "dsm.tif", error, error - half, error + half)
+    truth = write_raster(tmp_path / "reference.tif", [reference])
+    # Means of the 1, 2, 3 and 4 smallest, over 2.5: by errors .4 .6 .8 1, by widths .8 .6 28/30 1; trapezoids of 1/4.
+    best, by_width = 0.25 * (0.4 + 0.5 + 0.7 + 0.9), 0.25 * (0.8 + 0.7 + 23 / 30 + 29 / 30)
+    ranking = evaluate_surface(model, truth, registers=False)["ranking"]
+    assert ranking["half_width"] == pytest.approx(by_width - best)
+    perfect = write_surface(tmp_path / "best.tif", error, error - error, error + error)
+    assert evaluate_surface(perfect, truth, registers=False)["ranking"]["half_width"] == pytest.approx(0)
+
+
+def test_evaluate_surface__a_reference_of_this_tool_is_no_truth(tmp_path):
+    height = np.array([[1.0, 2]])
+    model, other = (
+        write_surface(tmp_path / name, height, height - 1, height + 1, {"RUNS": "2026"}) for name in ("a.tif", "b.tif")
+    )
+    (line,) = evaluate_surface(model, other, registers=False)["warnings"]
+    assert f"{other} is a surface of this tool, too: errors that both share do not show" in line
+
+
 def test_evaluate_surface__warns_of_a_surface_that_is_upside_down(tmp_path):
     height = np.arange(20.0)[np.newaxis]
     surface = write_surface(tmp_path / "dsm.tif", height, height - 1, height + 1)
@@ -244,7 +292,8 @@ def test_evaluate_command__of_a_surface(tmp_path):
     result = invoke("evaluate", "--dsm", model, "--reference", reference)
     assert result.exit_code == 0
     assert result.stdout.splitlines()[2].split() == [
-        "all", "cells", "2", "-3.750", "-3.750", "4.818", "4.962", "6.350", "5.850", "0.500", "1.000", "1.000", "-"
+        "all", "cells", "2", "-3.750", "-3.750", "4.818", "4.962", "6.350", "5.850", "0.500", "0.500", "1.000", "1.000",
+        "-", "1.000", "0.500"
     ]  # fmt: skip
     assert result.stdout.splitlines()[-1] == "the reference was not moved: too few common heights"
     alone = invoke("evaluate", "--dsm", model, "--reference", reference, "--no-register")
