@@ -42,16 +42,19 @@ class Details:
         from sat_intervals.raster.publishing import failing, write_file, write_record
         from sat_intervals.show.accuracy import draw_error_map, draw_height_profile, draw_reliability
 
-        figures, table, reliability, errors, heights = paths = [folder / name for name in _FILES]
-        compared = open_comparison(surface.dsm, surface.reference, report["registration"])
-        profile = read_profile(compared, self.line)
+        paths = [folder / name for name in _FILES[: 3 if report["points"] else None]]
+        figures, table, reliability, *maps = paths
+        if maps:
+            compared = open_comparison(surface.dsm, surface.reference, report["registration"])
+            profile = read_profile(compared, self.line)
         with failing(figures):
             folder.mkdir(parents=True, exist_ok=True)
         write_record(figures, {"software": "sat-intervals"} | report)
         write_file(table, f"<!-- sat-intervals -->\n{surface_markdown(str(surface.dsm), report)}".encode())
         draw_reliability(report, reliability, surface.dsm.name)
-        draw_error_map(compared, report["all"]["nmad"], errors)
-        draw_height_profile(profile, heights, (surface.dsm.name, surface.reference.name))
+        if maps:
+            draw_error_map(compared, report["all"]["nmad"], maps[0])
+            draw_height_profile(profile, maps[1], (surface.dsm.name, surface.reference.name))
         return paths
 
 
@@ -88,7 +91,14 @@ def evaluate_heights(surface: Surface, details: Details, printing: Printing) -> 
     if details.pictures:
         details.check_folder(details.pictures, surface)
     within = {} if details.within is None else {"within": details.within}
-    report = evaluate_surface(surface.dsm, surface.reference, details.classes, registers=surface.registers, **within)
+    report = evaluate_surface(
+        surface.dsm,
+        surface.reference,
+        details.classes,
+        registers=surface.registers,
+        reference_sigma=surface.sigma,
+        **within,
+    )
     printing.say(report)
     if not printing.as_json:
         show_surface(str(surface.dsm), report)

@@ -155,11 +155,12 @@ def note_geometry(outs: Sequence[Path], sensor_files: Sequence[SensorFiles]) -> 
 
 @dataclass(frozen=True)
 class Surface:
-    """A surface model, reference heights to compare it with, and whether these are moved to it first."""
+    """A surface model, reference heights to compare it with, whether these are moved to it first, and their sigma."""
 
     dsm: Path
     reference: Path
     registers: bool
+    sigma: float | None
 
 
 # Options of commands for surface models and others that apply to both.
@@ -169,19 +170,34 @@ _FOR_BOTH = {"output", "overwrite", "name", "as_json", "quiet", "debug", "log_fi
 def surface_options(dsm_help: str, others: str, *of_surfaces: str) -> Decorator:
     """Add --dsm, --reference and --no-register to a command for ``others``; ``of_surfaces``: what else needs --dsm."""
 
-    def gather(*, dsm: Path | None, reference: Path | None, no_register: bool) -> Surface | None:
+    def gather(
+        *, dsm: Path | None, reference: Path | None, no_register: bool, reference_sigma: float | None
+    ) -> Surface | None:
         if bool(dsm) != bool(reference):
             raise click.UsageError("--dsm and --reference go together: give both.")
         if no_register and not dsm:
             raise click.UsageError("--no-register goes with --dsm: leave it out.")
+        if reference_sigma is not None and not dsm:
+            raise click.UsageError("--reference-sigma goes with --dsm: leave it out.")
         _check_options(bool(dsm), others, of_surfaces)
-        return Surface(dsm, reference, not no_register) if dsm and reference else None
+        return Surface(dsm, reference, not no_register, reference_sigma) if dsm and reference else None
 
     return gathered(
         "surface",
         gather,
         click.option("--dsm", type=FILE, help=dsm_help),
-        click.option("--reference", type=FILE, help="With --dsm: reference heights above the same datum, in any CRS."),
+        click.option(
+            "--reference",
+            type=FILE,
+            help="With --dsm: reference heights above the same datum, in any CRS: a raster, or points (CSV, "
+            "GeoPackage, Parquet, LAZ).",
+        ),
+        click.option(
+            "--reference-sigma",
+            type=float,
+            metavar="METRES",
+            help="With --dsm: standard deviation of the errors of points without a column sigma; default 0.",
+        ),
         click.option("--no-register", is_flag=True, help="With --dsm: do not move the reference to the surface."),
     )
 
@@ -191,7 +207,7 @@ def _check_options(has_surface: bool, others: str, of_surfaces: Sequence[str]) -
     context = click.get_current_context()
     for parameter in context.command.params:
         key, option = parameter.name or "", parameter.opts[0]
-        if not context.params[key] or key in ("dsm", "reference", "no_register"):
+        if not context.params[key] or key in ("dsm", "reference", "no_register", "reference_sigma"):
             continue
         if not has_surface and key in of_surfaces:
             raise click.UsageError(f"{option} applies only with --dsm: leave it out.")

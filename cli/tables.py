@@ -18,6 +18,7 @@ _WIDEST = 10_000
 # What the nominal level of intervals is, in reports and for a reader.
 _NOMINAL = {"coverage": "coverage asked for", "alpha": "alpha"}
 _EXPECTED = ("all", "high", "edge", "low", "lowest", "mean_width", "median_width", "score")
+_PRECISE = 0.02  # standard error of a coverage that is precise
 
 
 def show(header: Sequence[str], rows: Sequence[Sequence[str]], title: str) -> None:
@@ -144,9 +145,23 @@ def _notes(report: dict[str, Any]) -> list[str]:
     return [
         "errors are height - reference; bias is their mean; LE90: 90 % of the absolute errors are not larger",
         "with height, within: shares of the reference heights that have a height, and one with an error up to that",
+        *points_lines(report["points"], report["all"]["with_interval"], report["all"]["coverage_deviation"]),
         _nominal_line(report),
         *_ranking_lines(report["ranking"]),
         *report["warnings"],
+    ]
+
+
+def points_lines(points: dict[str, float] | None, count: int, deviation: float | None) -> list[str]:
+    """Return what the coverage of points is, and how many a precise one takes; ``count``: those with an interval."""
+    if points is None or deviation is None:
+        return []
+    noise = "coverage is that of the true heights, other figures include errors of the points"
+    needed = math.ceil(count * (deviation / _PRECISE) ** 2)
+    return [
+        *([f"{noise} (standard deviation {points['sigma']:g} m)"] if points["sigma"] else []),
+        f"{count} points give the coverage with a standard error of {deviation:.3f}: one of {_PRECISE:g} takes about "
+        f"{needed} like these",
     ]
 
 

@@ -36,6 +36,8 @@ class HeightClass(StrictModel):
 class HeightCalibration(CalibrationFile):
     """Margins of the intervals of a surface model, by class of relief, and in each of half width, rising.
 
+    Half widths are multiplied by ``factor`` first.
+
     ``coverage`` is the share of true heights inside. If the reference was ``registered`` to the surface, the margins do
     not include a constant shift. ``surface`` says what surfaces they belong to, see `surface_key`.
     """
@@ -45,6 +47,7 @@ class HeightCalibration(CalibrationFile):
     coverage: float = Field(gt=0, lt=1)
     registered: bool
     surface: dict[str, str]
+    factor: float = Field(default=1.0, ge=0)
     classes: tuple[HeightClass, ...] = Field(strict=False, min_length=1)
     provenance: dict[str, Any] = Field(default_factory=dict)
 
@@ -56,14 +59,15 @@ class HeightCalibration(CalibrationFile):
             _check_rising("half_width_below", [kind.half_width_below for kind in kinds])
         return classes
 
-    def table(self) -> tuple[np.ndarray, tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
-        """Return limits of relief, and of each class of relief limits of half width and margins."""
+    def table(self) -> tuple[np.ndarray, tuple[np.ndarray, ...], tuple[np.ndarray, ...], float]:
+        """Return limits of relief, of each class of relief limits of half width and margins, and the factor."""
         groups = _by_relief(self.classes)
         relief = np.array([limit for limit, _ in groups if limit is not None])
         half_widths = (
             np.array([kind.half_width_below for kind in kinds[:-1]], dtype=np.float64) for _, kinds in groups
         )
-        return relief, tuple(half_widths), tuple(np.array([kind.margin for kind in kinds]) for _, kinds in groups)
+        margins = (np.array([kind.margin for kind in kinds]) for _, kinds in groups)
+        return relief, tuple(half_widths), tuple(margins), self.factor
 
     def check_surface(self, key: Mapping[str, str]) -> None:
         """Raise if the calibration belongs to other surfaces than one with this key."""

@@ -10,19 +10,23 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sat_intervals.evaluate.metrics import Intervals, share
+from sat_intervals.kernels.label_noise import TrueErrors, true_errors
 from sat_intervals.match.histogram import Histogram
 
 BLOCKS = 4  # parts of the ground along each of its sides: errors within one are correlated
 LARGEST = 500  # errors and widths are counted up to this many metres
 # Factor of the NMAD, a robust standard deviation: sigma of a normal distribution (Hoehle and Hoehle 2009).
 _NORMAL = 1.4826
+NARROWEST = 0.01  # metres: half widths in which errors are measured are at least that
+_FEWEST = 30  # noisy errors that give a coverage
 _RANKED = 500  # steps a metre in which values are ranked
 
 
 class Heights(NamedTuple):
     """Heights of cells, their bounds, reference heights and relief, see `relief_of`: ``(n,)`` metres.
 
-    Bounds are NaN without an interval. ``block`` is the part of the ground, see `Comparison.block_of`.
+    Bounds are NaN without an interval. ``sigma`` is the standard deviation of errors of the reference, 0 where it is
+    exact; ``block`` the part of the ground, see `Comparison.block_of`.
     """
 
     height: np.ndarray
@@ -30,6 +34,7 @@ class Heights(NamedTuple):
     upper: np.ndarray
     reference: np.ndarray
     relief: np.ndarray
+    sigma: np.ndarray
     block: np.ndarray
 
     @property
@@ -41,6 +46,11 @@ class Heights(NamedTuple):
     def outside(self) -> np.ndarray:
         """Return how far the reference is outside the intervals, negative inside."""
         return np.asarray(np.maximum(self.lower - self.reference, self.reference - self.upper))
+
+    def true_errors(self) -> TrueErrors:
+        """Return the distribution of true errors, from the middle of intervals and in half widths."""
+        half = np.maximum(self.half_width, NARROWEST)
+        return true_errors(((self.lower + self.upper) / 2 - self.reference) / half, self.sigma / half)
 
     def of(self, chosen: np.ndarray) -> "Heights":
         """Return a part."""
@@ -58,6 +68,7 @@ class Accuracy:
         self._count = self._missing = self._near = 0
         self._blocks = np.zeros((2, BLOCKS**2))  # intervals, and those that contain their reference
         self._sum = self._squares = 0.0
+        self._noisy: list[Heights] = []
         self._errors, self._intervals = Histogram(-LARGEST, LARGEST, 1000), Intervals(LARGEST, nominal)
 
     def add(self, cells: Heights, missing: int) -> None:
@@ -73,11 +84,16 @@ class Accuracy:
         self._intervals.add(np.maximum(bounded.outside, 0), 2 * bounded.half_width)
         for total, blocks in zip(self._blocks, (bounded.block, bounded.block[bounded.outside <= 0]), strict=True):
             total += np.bincount(blocks, minlength=total.size)
+        if bounded.sigma.any():
+            self._noisy.append(bounded)
 
     def report(self) -> dict[str, Any]:
         """Return all figures, None without cells: metres, and shares of cells with an interval."""
         deviation, low, high = self._errors.deviation(), self._errors.quantile(0.05), self._errors.quantile(0.95)
         intervals = self._intervals.report()
+        coverage, of_coverage = intervals["accuracy"], coverage_deviation(*self._blocks)
+        if self._noisy:
+            coverage, of_coverage = coverage_of(Heights(*map(np.concatenate, zip(*self._noisy, strict=True))))
         halves = {
             name: None if (width := intervals[f"{name}_width"]) is None else width / 2 for name in ("mean", "median")
         }
@@ -92,13 +108,31 @@ class Accuracy:
             "le90": self._errors.quantile_of_absolutes(0.9),
             "p95_p5": None if low is None or high is None else high - low,
             "with_interval": intervals["count"],
-            "coverage": intervals["accuracy"],
-            "coverage_deviation": coverage_deviation(*self._blocks),
+            "coverage": coverage,
+            "coverage_deviation": of_coverage,
             "mean_half_width": halves["mean"],
             "median_half_width": halves["median"],
-            "interval_score": intervals["interval_score"],
+            "interval_score": None if self._noisy else intervals["interval_score"],
             "needed_half_width": None if self._nominal is None else self._errors.quantile_of_absolutes(self._nominal),
         }
+
+
+def coverage_of(cells: Heights) -> tuple[float | None, float | None]:
+    """Return the share of true heights inside intervals, and its standard error; None of few noisy heights."""
+    if not cells.sigma.any():
+        counts, inside = (
+            np.bincount(cells.block[chosen].astype(np.int64), minlength=BLOCKS**2)
+            for chosen in (slice(None), cells.outside <= 0)
+        )
+        return share(inside.sum(), counts.sum()), coverage_deviation(counts, inside)
+    if cells.height.size < _FEWEST:
+        return None, None
+    coverage = cells.true_errors().within(1)
+    variance = coverage * (1 - coverage) / cells.height.size
+    others = [cells.of(cells.block != block).true_errors().within(1) for block in np.unique(cells.block)]
+    if len(others) > 1:  # the jackknife
+        variance = max(variance, (len(others) - 1) * float(np.var(others)))
+    return coverage, float(np.sqrt(variance))
 
 
 def coverage_deviation(counts: np.ndarray, inside: np.ndarray) -> float | None:

@@ -9,8 +9,10 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.accuracy import BLOCKS, LARGEST, Heights
+from sat_intervals.evaluate.points import blocks_of, cells_of, read_points
+from sat_intervals.heights.point_files import ENDINGS
 from sat_intervals.kernels.conformal import AROUND, relief_of
-from sat_intervals.kernels.registration import REACH, every_nth, put_together, register, spread_blocks
+from sat_intervals.kernels.registration import REACH, Blocks, every_nth, put_together, register, spread_blocks
 from sat_intervals.kernels.relief import sampled
 from sat_intervals.raster import GROUND, Georeferencing, read_heights, read_layers, read_place, read_tags, surface_place
 from sat_intervals.raster.heightfield import warn_of_no_data
@@ -33,6 +35,7 @@ class Comparison:
     resolution: float  # of the reference in metres
     finer: int  # heights of the reference along a cell
     area: Window  # cells where the reference may have heights
+    points: np.ndarray | None = None  # instead of a raster, see `read_points`
     registration: dict[str, Any] | None = None
 
     @property
@@ -95,18 +98,28 @@ class Comparison:
 
 
 def open_comparison(
-    surface: str | Path, reference: str | Path, registration: dict[str, Any] | None = None
+    surface: str | Path,
+    reference: str | Path,
+    registration: dict[str, Any] | None = None,
+    sigma: float | None = None,
 ) -> Comparison:
-    """Open a surface model and its reference, which a registration moves."""
+    """Open a surface model and its reference, which a registration moves; ``sigma`` is that of points."""
     surface, reference = Path(surface), Path(reference)
     shape, place = surface_place(surface)
+    if reference.suffix.lower() in ENDINGS:
+        points = read_points(surface, reference, place, shape, sigma)
+        cells = cells_of(points, place)
+        area = Window.around(cells.min(axis=1).tolist(), (cells.max(axis=1) + 1).tolist())
+        return Comparison(surface, reference, shape, place, place.pixel_size[0], 1, area, points, registration)
+    if sigma is not None:
+        raise SatIntervalsError(f"{reference} is a raster: a sigma of its heights is for points, leave it out")
     read_place(reference)
     check_reference(reference, surface)
     warn_of_no_data(reference)
     resolution = resolution_of(reference, place)
     finer = max(1, round(place.pixel_size[0] / resolution))
     area = covered_window(reference, place, shape)
-    return Comparison(surface, reference, shape, place, resolution, finer, area, registration)
+    return Comparison(surface, reference, shape, place, resolution, finer, area, registration=registration)
 
 
 def check_common(given: Comparison, count: int, median: float | None) -> list[str]:
@@ -125,7 +138,7 @@ def check_common(given: Comparison, count: int, median: float | None) -> list[st
 
 def shared_errors(given: Comparison) -> list[str]:
     """Return a warning if the reference is a surface of this tool, too."""
-    if "RUNS" not in read_tags(given.reference):
+    if given.points is not None or "RUNS" not in read_tags(given.reference):
         return []
     return [
         f"{given.reference} is a surface of this tool, too: errors that both share do not show, so coverage is too "
@@ -140,18 +153,20 @@ def tiles(given: Comparison) -> Iterator[Window]:
 
 
 class Compared(NamedTuple):
-    """Heights of both, and where they are among the reference heights of a tile: mask or rows and columns.
+    """Heights of both, and rows and columns of the reference heights of a tile that they are of.
 
-    ``missing``: where reference heights are whose cells have none.
+    ``missing``: those of reference heights whose cells have none.
     """
 
     cells: Heights
-    known: Any
-    missing: Any
+    known: tuple[np.ndarray, ...]
+    missing: tuple[np.ndarray, ...]
 
 
 def compared(given: Comparison, window: Window) -> Compared:
     """Read the cells of a tile that both have a height, once for each reference height."""
+    if given.points is not None:
+        return _compared_points(given, given.points + np.array([*given.shift, 0.0]), window)
     finer = given.finer
     height, lower, upper, relief = (
         np.repeat(np.repeat(band, finer, axis=0), finer, axis=1) for band in _bands(given, window)
@@ -160,8 +175,19 @@ def compared(given: Comparison, window: Window) -> Compared:
     known = np.isfinite(reference) & np.isfinite(height)
     row, column = np.arange(height.shape[0])[:, np.newaxis] // finer, np.arange(height.shape[1]) // finer
     block = given.block_of(row + window.row, column + window.column)
-    cells = Heights(height, lower, upper, reference, relief, block).of(known)
-    return Compared(cells, known, np.isfinite(reference) & np.isnan(height))
+    cells = Heights(height, lower, upper, reference, relief, np.zeros(height.shape), block).of(known)
+    return Compared(cells, np.nonzero(known), np.nonzero(np.isfinite(reference) & np.isnan(height)))
+
+
+def _compared_points(given: Comparison, points: np.ndarray, window: Window) -> Compared:
+    """Read the cells of a tile that points fall in."""
+    row, column = cells_of(points, given.place)
+    inside = (row >= window.row) & (row < window.row_stop) & (column >= window.column) & (column < window.column_stop)
+    row, column, block = row[inside] - window.row, column[inside] - window.column, given.block_of(row, column)[inside]
+    height, lower, upper, relief = _bands(given, window)[:, row, column]
+    known = np.isfinite(height)
+    cells = Heights(height, lower, upper, points[inside, 2], relief, points[inside, 3], block).of(known)
+    return Compared(cells, (row[known], column[known]), (row[~known], column[~known]))
 
 
 def _bands(given: Comparison, window: Window) -> np.ndarray:
@@ -173,6 +199,18 @@ def _bands(given: Comparison, window: Window) -> np.ndarray:
 
 def registered(given: Comparison) -> tuple[Comparison, list[str]]:
     """Return the comparison with the reference moved to the surface; the same and a warning with too few heights."""
+    if given.points is not None:
+        blocks = blocks_of(given.surface, given.points, given.place, given.shape)
+    else:
+        blocks = _blocks_of_raster(given)
+    found = register(blocks)
+    if found is None:
+        return given, ["the reference was not moved: too few common heights"]
+    return replace(given, registration=found.report()), []
+
+
+def _blocks_of_raster(given: Comparison) -> Blocks | None:
+    """Return cells of the surface on blocks of the reference."""
     parts = []
     for core in spread_blocks(given.area, _SMALLEST):
         height = read_layers(given.surface, core)[0].astype(np.float64)
@@ -182,7 +220,4 @@ def registered(given: Comparison) -> tuple[Comparison, list[str]]:
             row, column = row[chosen], column[chosen]
             surface = given.heights(*given.cells(core.grown(REACH + 1, REACH + 1)), smooth=True)
             parts.append((surface, column + REACH + 1.0, row + REACH + 1.0, height[row, column]))
-    found = register(put_together(parts, given.cell, moves=1))
-    if found is None:
-        return given, ["the reference was not moved: too few common heights"]
-    return replace(given, registration=found.report()), []
+    return put_together(parts, given.cell, moves=1)

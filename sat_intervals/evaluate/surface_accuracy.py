@@ -17,6 +17,7 @@ from sat_intervals.evaluate.comparison import (
     shared_errors,
     tiles,
 )
+from sat_intervals.evaluate.points import summary_of
 from sat_intervals.raster import read_heights, read_layers, read_place, read_small_layers, read_tags
 from sat_intervals.tiling import Window
 
@@ -55,14 +56,17 @@ class _Figures:
         self._whole, self._ranking = Accuracy(*judging), Ranking()
         self._slopes, self._halves = _Ranges(SLOPES, *judging), _Ranges(HALF_WIDTHS, *judging)
         self._classes: dict[int, Accuracy] = {}
+        self._has_slopes = False
 
     def add(self, given: Comparison, window: Window, classes: Path | None) -> None:
         """Add the cells of a tile."""
         cells, known, missing = compared(given, window)
-        self._whole.add(cells, int(missing.sum()))
+        self._whole.add(cells, missing[0].size)
         self._ranking.add(cells)
-        slope = _slope(given, window)
-        self._slopes.add(cells, slope[known], slope[missing])
+        if given.points is None:
+            self._has_slopes = True
+            slope = _slope(given, window)
+            self._slopes.add(cells, slope[known], slope[missing])
         self._halves.add(cells, cells.half_width, np.empty(0))
         if classes is not None:
             values = _classes(given, classes, window)
@@ -76,7 +80,7 @@ class _Figures:
         """Return the figures, see `evaluate_surface`."""
         return {
             "all": self._whole.report(),
-            "slope": self._slopes.report(),
+            "slope": self._slopes.report() if self._has_slopes else [],
             "half_width": [kind | {"completeness": None, "within": None} for kind in self._halves.report()],
             "classes": [{"class": number, **self._classes[number].report()} for number in sorted(self._classes)],
             "ranking": self._ranking.report(),
@@ -90,6 +94,7 @@ def evaluate_surface(
     *,
     registers: bool = True,
     within: float = 1.0,
+    reference_sigma: float | None = None,
 ) -> dict[str, Any]:
     """Evaluate the heights and intervals of a surface model against reference heights.
 
@@ -100,13 +105,16 @@ def evaluate_surface(
     reference
         Raster of heights in metres above the same datum, in any CRS. If it is n times finer than the cells, each cell
         is compared with n x n heights; else with the one nearest to its centre, or interpolated there if the reference
-        was moved.
+        was moved. Or points, see `sat_intervals.heights.point_files`: each is compared with the cell it falls in.
     classes
         Raster of whole numbers, such as land cover, in any CRS.
     registers
         Whether the reference is first moved by its constant shift from the surface.
     within
         Metres of error up to which a height counts as found.
+    reference_sigma
+        Standard deviation in metres of the errors of points without a column ``sigma``. Coverage is then that of the
+        true heights; all other figures are those of the points.
 
     Returns
     -------
@@ -114,14 +122,15 @@ def evaluate_surface(
     reference (degrees), ``half_width`` of the interval (metres) and ``classes``; ``ranking``, how well ``half_width``
     ranks errors, and ``relief``, the range of heights in 5 x 5 cells, alone: the area under the sparsification error
     curve, 0 is perfect; ``within``; ``registration``, see `Registration.report`; ``nominal``, the level of the
-    intervals, and what it is (``nominal_is``): ``coverage``, ``alpha``, or None; ``warnings``, lines.
+    intervals, and what it is (``nominal_is``): ``coverage``, ``alpha``, or None; ``points``, their ``count`` and
+    median ``sigma``, None for a raster; ``warnings``, lines.
 
     Raises
     ------
     SatIntervalsError
         A file cannot be read, has no heights in common with the other, or another datum or unit.
     """
-    given = open_comparison(surface, reference)
+    given = open_comparison(surface, reference, sigma=reference_sigma)
     tags = read_tags(given.surface)
     nominal_is = next((name for name in ("coverage", "alpha") if name.upper() in tags), None)
     nominal = float(tags[nominal_is.upper()]) if nominal_is else None
@@ -133,7 +142,7 @@ def evaluate_surface(
         figures.add(moved, window, None if classes is None else Path(classes))
         if moved is not given:
             cells, _, missing = compared(given, window)
-            before.add(cells, int(missing.sum()))
+            before.add(cells, missing[0].size)
     report = figures.report()
     in_place = before.report() if moved is not given else report["all"]
     warnings += shared_errors(given) + check_common(given, in_place["count"], in_place["median"])
@@ -146,6 +155,7 @@ def evaluate_surface(
     return {
         "nominal": nominal,
         "nominal_is": nominal_is,
+        "points": None if given.points is None else summary_of(given.points),
         "registration": moved.registration,
         "within": within,
         "warnings": warnings,

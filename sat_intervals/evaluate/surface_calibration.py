@@ -1,7 +1,7 @@
 """Calibrate the intervals of a surface model in metres, against reference heights.
 
-The margins are those of split-conformal prediction, by class of relief and half width. Expected figures are those of
-blocks of ground that were held out.
+The margins are those of split-conformal prediction, by class of relief and half width; of few or noisy heights a single
+factor of the half widths. Expected figures are those of blocks of ground that were held out.
 """
 
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ import numpy as np
 from sat_intervals.config import HeightCalibration, HeightClass, surface_key
 from sat_intervals.config.calibration import COVERAGES
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.evaluate.accuracy import Heights
+from sat_intervals.evaluate.accuracy import NARROWEST, Heights, coverage_of
 from sat_intervals.evaluate.comparison import (
     Comparison,
     check_common,
@@ -24,10 +24,13 @@ from sat_intervals.evaluate.comparison import (
     shared_errors,
     tiles,
 )
+from sat_intervals.evaluate.points import summary_of
 from sat_intervals.kernels.conformal import Margins, least_number, limits_between, margin_of, widened
 from sat_intervals.raster import read_tags
 
 _MOST = 1 << 20  # heights that are used: a sample, if there are more
+# Misses of a factor; heights below so many times those of a class have a factor, not classes.
+_MISSES, _FEW = 2, 4
 _CLASSES = 4  # of relief, and of half width in each, fewer with few cells
 
 
@@ -39,7 +42,7 @@ class Fit(NamedTuple):
 
     def classes(self) -> tuple[HeightClass, ...]:
         """Return the classes of a calibration."""
-        relief, *parts = self.margins
+        relief, *parts, _ = self.margins
         return tuple(
             HeightClass(relief_below=below, half_width_below=limit, margin=float(margin), cells=round(float(cells)))
             for below, *kinds in zip([*relief.tolist(), None], *parts, self.cells, strict=True)
@@ -48,7 +51,13 @@ class Fit(NamedTuple):
 
 
 def calibrate_surface(
-    surface: str | Path, reference: str | Path, name: str, *, coverage: float | None = None, registers: bool = True
+    surface: str | Path,
+    reference: str | Path,
+    name: str,
+    *,
+    coverage: float | None = None,
+    registers: bool = True,
+    reference_sigma: float | None = None,
 ) -> HeightCalibration:
     """Find the margins with which the intervals of a surface model contain a share of reference heights.
 
@@ -56,7 +65,7 @@ def calibrate_surface(
     ----------
     surface
         File of `make_surface`, made without a calibration and without a largest width.
-    reference, registers
+    reference, registers, reference_sigma
         As for `evaluate_surface`.
     name
         Name of the calibration, which a surface made with it has in its tags.
@@ -75,7 +84,7 @@ def calibrate_surface(
     SatIntervalsError
         A file cannot be used, or too few cells have an interval and a reference height.
     """
-    given = open_comparison(surface, reference)
+    given = open_comparison(surface, reference, sigma=reference_sigma)
     tags = read_tags(given.surface)
     coverage = _checked_coverage(given.surface, tags, coverage)
     moved, warnings = registered(given) if registers else (given, [])
@@ -88,13 +97,14 @@ def calibrate_surface(
         once = f" (those in a pixel of {given.resolution:.3g} m count as one)" if _coarser(given) > 1 else ""
         raise SatIntervalsError(
             f"{round(sample.height.size * cells_of_height)} cells of {given.surface} have an interval and a height in "
-            f"{given.reference}{once}, {least_number(coverage)} are needed for coverage {coverage:g}: give a larger "
-            "reference"
+            f"{given.reference}{once}, {least_number(coverage, _MISSES)} are needed for coverage {coverage:g}: give a "
+            "larger reference"
         )
     provenance = {
         "software": f"sat-intervals {version('sat-intervals')}",
         "surface": str(given.surface),
         "reference": str(given.reference),
+        "points": None if given.points is None else summary_of(given.points),
         "shift": [round(value, 3) for value in moved.shift] if is_moved else None,
         "before": _figures(sample),
         "expected": _expected(sample, cells_of_height, coverage),
@@ -105,6 +115,7 @@ def calibrate_surface(
         coverage=coverage,
         registered=is_moved,
         surface=surface_key(tags, given.cell),
+        factor=fit.margins.factor,
         classes=fit.classes(),
         provenance=provenance,
     )
@@ -161,8 +172,11 @@ def _datum_warnings(given: Comparison, sample: Heights) -> list[str]:
 def fitted(sample: Heights, cells_of_height: float, coverage: float) -> Fit | None:
     """Return margins by classes of relief and half width, of fewer classes with few cells; None with too few."""
     half, least = sample.half_width, least_number(coverage) / cells_of_height
-    if half.size < least:
+    if half.size * cells_of_height < least_number(coverage, _MISSES):
         return None
+    if sample.sigma.any() or half.size < _FEW * least:
+        factor = np.ceil(1000 * _factor(sample, cells_of_height, coverage)) / 1000
+        return Fit(Margins.of_factor(float(factor)), (np.array([cells_of_height * half.size]),))
     relief = limits_between(sample.relief, _CLASSES, least)
     limits, margins, cells = [], [], []
     for kind in range(relief.size + 1):
@@ -173,6 +187,15 @@ def fitted(sample: Heights, cells_of_height: float, coverage: float) -> Fit | No
         margins.append(np.ceil(1000 * np.array(found)) / 1000)  # millimetres
         cells.append(cells_of_height * np.bincount(classes))
     return Fit(Margins(relief, tuple(limits), tuple(margins)), tuple(cells))
+
+
+def _factor(sample: Heights, cells_of_height: float, coverage: float) -> float:
+    """Return the factor of half widths with which intervals, about their middles, contain a share of true heights."""
+    if not sample.sigma.any():
+        half = np.maximum(sample.half_width, NARROWEST)
+        return 1 + margin_of(sample.outside / half, coverage)
+    count = cells_of_height * sample.height.size  # the rank of split-conformal prediction
+    return sample.true_errors().factor(min(np.ceil((count + 1) * coverage) / count, 1 - 0.5 / count))
 
 
 def held_out(sample: Heights, cells_of_height: float, coverage: float) -> Heights | None:
@@ -192,13 +215,16 @@ def _expected(sample: Heights, cells_of_height: float, coverage: float) -> dict[
     found = held_out(sample, cells_of_height, coverage)
     if found is None:
         return None
-    blocks = [found.outside[found.block == number] <= 0 for number in np.unique(found.block)]
-    of_blocks = [float(inside.mean()) for inside in blocks if inside.size * cells_of_height >= least_number(coverage)]
+    blocks = [found.of(found.block == number) for number in np.unique(found.block)]
+    shares = [coverage_of(one)[0] for one in blocks if one.height.size * cells_of_height >= least_number(coverage)]
+    of_blocks = [share for share in shares if share is not None]
     return _figures(found) | {"lowest": round(min(of_blocks), 4) if of_blocks else None}
 
 
-def _figures(sample: Heights) -> dict[str, float]:
-    """Return coverage, median and mean half width of intervals."""
-    inside, half = sample.outside <= 0, sample.half_width
-    figures = {"coverage": inside.mean(), "median_half_width": np.median(half), "mean_half_width": half.mean()}
-    return {name: round(float(value), 4) for name, value in figures.items()}
+def _figures(sample: Heights) -> dict[str, float | None]:
+    """Return coverage of true heights and its standard error, median and mean half width of intervals."""
+    coverage, deviation = coverage_of(sample)
+    half = sample.half_width
+    figures = {"coverage": coverage, "deviation": deviation, "median_half_width": np.median(half)}
+    figures |= {"mean_half_width": half.mean()}
+    return {name: None if value is None else round(float(value), 4) for name, value in figures.items()}

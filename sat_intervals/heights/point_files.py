@@ -20,27 +20,39 @@ _HEIGHTS = (
     "height", "h", "z", "elevation", "ellipsoidal_height", "h_mean", "h_te_best_fit", "h_te_median", "h_ph", "h_li",
     "elev_lowestmode", "elevation_lm")  # fmt: skip
 _GEOMETRIES = "wkt", "geometry", "geom", "the_geom"
+ENDINGS = (".csv", ".parquet", ".geoparquet", ".pq", ".las", ".laz", ".gpkg", ".geojson", ".shp", ".fgb")
+"""Names of files of points end so; other vectors of GDAL are read, too."""
 _NOISE = 7, 18  # classes of LAS points that are noise
 
 
 class PointFile:
-    """Points of a CSV file with a header, Parquet, LAS, LAZ, or vectors of GDAL; ``crs`` replaces that of the file."""
+    """Points of a CSV file with a header, Parquet, LAS, LAZ, or vectors of GDAL; ``crs`` replaces that of the file.
 
-    def __init__(self, path: Path, crs: str | None, vertical: Vertical) -> None:
+    ``surface``: CRS of a file without one, and what heights of a surface refer to that the points are compared with.
+    """
+
+    def __init__(
+        self, path: Path, crs: str | None, vertical: Vertical, surface: tuple[str | None, str] = (None, "")
+    ) -> None:
         check_file(path, "give a file of points")
         self._path, ending = path, path.suffix.lower()
         is_cloud = ending in (".las", ".laz")
         crs_of, self._parts = (_crs_of_las, _las) if is_cloud else (_crs_of_table, _of_table)
         with _reading(path):
             own = crs_of(path)
-        self.frame = Frame(str(path), crs or own, vertical)
+        self.frame = Frame(str(path), crs or own or surface[0], vertical, surface[1])
 
-    def parts(self) -> Iterator[np.ndarray]:
-        """Yield ``(n, 3)`` float64 x, y and height in the frame, of points that have all and are on the ground."""
+    def parts(self, *, with_sigma: bool = False) -> Iterator[np.ndarray]:
+        """Yield ``(n, 3)`` float64 x, y and height in the frame, of points that have all and are on the ground.
+
+        A fourth column, if asked for, has the column ``sigma`` of a table, NaN without.
+        """
         with _reading(self._path):
             for part in self._parts(self._path):
                 # other heights are no-data values
-                yield part[np.isfinite(part).all(axis=1) & is_ground(part[:, 2] * self.frame.unit)]
+                places = part[:, :3]
+                known = np.isfinite(places).all(axis=1) & is_ground(places[:, 2] * self.frame.unit)
+                yield part[known] if with_sigma else places[known]
 
 
 @contextmanager
@@ -117,11 +129,12 @@ def _crs_of_table(path: Path) -> str | None:
 
 
 def _of_table(path: Path) -> Iterator[np.ndarray]:
-    """Yield points; the height is that of the geometry, unless it is constant or missing beside a column of heights."""
+    """Yield points and sigma; the height is that of the geometry, unless constant or missing beside one of heights."""
     with _table(path) as (names, geometry, *_):
         chosen, _ = _columns(path, names, geometry)
+        noise = [name for name in names if name.strip().lower() == "sigma"][:1]
     uses_column = None
-    with _table(path, chosen) as (*_, batches):
+    with _table(path, [*chosen, *noise]) as (*_, batches):
         for batch in batches:
             values = [batch.column(name).to_numpy(zero_copy_only=False) for name in chosen]
             places = np.column_stack(values).astype(np.float64) if len(chosen) == 3 else _places(path, *values)
@@ -129,7 +142,8 @@ def _of_table(path: Path) -> Iterator[np.ndarray]:
                 uses_column = len(chosen) == 2 and np.unique(places[np.isfinite(places[:, 2]), 2]).size < 2
             if uses_column:
                 places[:, 2] = values[1]
-            yield places
+            sigma = [batch.column(name).to_numpy(zero_copy_only=False).astype(np.float64) for name in noise]
+            yield np.column_stack([places, *(sigma or [np.full(len(places), np.nan)])])
 
 
 def _places(path: Path, geometry: np.ndarray, heights: np.ndarray | None = None) -> np.ndarray:
@@ -154,10 +168,10 @@ def _crs_of_las(path: Path) -> str | None:
 
 
 def _las(path: Path) -> Iterator[np.ndarray]:
-    """Yield points but those marked as noise or withheld."""
+    """Yield points but those marked as noise or withheld; sigma is unknown."""
     import laspy
 
     with laspy.open(path) as file:
         for points in file.chunk_iterator(_PART):
             kept = ~np.isin(np.asarray(points.classification), _NOISE) & (np.asarray(points.withheld) == 0)
-            yield np.column_stack([points.x, points.y, points.z])[kept]
+            yield np.column_stack([points.x, points.y, points.z, np.full(kept.size, np.nan)])[kept]

@@ -14,11 +14,18 @@ class Margins(NamedTuple):
 
     relief: ``(classes - 1,)`` limits.
     half_widths, margins: of each class of relief limits ``(n - 1,)`` and margins ``(n,)``.
+    factor: half widths are multiplied by it first.
     """
 
     relief: np.ndarray
     half_widths: tuple[np.ndarray, ...]
     margins: tuple[np.ndarray, ...]
+    factor: float = 1.0
+
+    @classmethod
+    def of_factor(cls, factor: float) -> "Margins":
+        """Return the margins of one class, which is widened by a factor alone."""
+        return cls(np.empty(0), (np.empty(0),), (np.zeros(1),), factor)
 
     def of(self, half_width: np.ndarray, relief: np.ndarray) -> np.ndarray:
         """Return the margin of each cell; any shape."""
@@ -26,7 +33,7 @@ class Margins(NamedTuple):
         for kind, (limits, margins) in enumerate(zip(self.half_widths, self.margins, strict=True)):
             own = kinds == kind
             found[own] = margins[np.searchsorted(limits, half_width[own], side="right")]
-        return found
+        return found + (self.factor - 1) * half_width
 
 
 def relief_of(height: np.ndarray) -> np.ndarray:
@@ -40,9 +47,9 @@ def relief_of(height: np.ndarray) -> np.ndarray:
     return np.asarray(highest - lowest)
 
 
-def least_number(coverage: float) -> int:
-    """Return the number of values that a margin needs."""
-    return int(np.ceil(max(30, 10 / (1 - coverage)) - 1e-9))
+def least_number(coverage: float, misses: int = 10) -> int:
+    """Return the number of values that a margin of a class needs, for so many misses; 30 at least."""
+    return int(np.ceil(max(30, misses / (1 - coverage)) - 1e-9))
 
 
 def limits_between(values: np.ndarray, most: int, least: float) -> np.ndarray:

@@ -106,7 +106,7 @@ def surface_of(outs, path, cell, bounds, kind, pixel, like=None):
     row, column = (4 * np.arange(size) // size for size in known.shape)
     block = 4 * row[:, np.newaxis] + column
     walls = range_[known] > max(2.2 * pixel, cell * PIXEL)
-    return Heights(height, lower, upper, truth, relief_of(height), block).of(known), walls
+    return Heights(height, lower, upper, truth, relief_of(height), 0 * height, block).of(known), walls
 
 
 def figures(sample, walls, pixel):
