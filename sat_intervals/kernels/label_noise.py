@@ -13,7 +13,7 @@ import numpy as np
 # Standard deviations of the mixture in half widths; steps towards its shares: more of them fit the noise.
 _SCALES = np.geomspace(0.02, 60, 28)
 _STEPS = 300
-_MOST = 4096  # errors that are used
+_MOST = 2048  # errors that are used
 
 
 class TrueErrors(NamedTuple):
