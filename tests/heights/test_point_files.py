@@ -108,3 +108,22 @@ def test_point_file__says_in_one_line_what_it_cannot_read(tmp_path):
             read(tmp_path / name)
         assert message in str(error.value)
         assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("ending", ["gpkg", "parquet", "csv"])
+def test_point_file__yields_a_column_sigma_if_asked_for(ending, tmp_path):
+    from pyarrow import parquet, table
+    from pyogrio.raw import write
+
+    path, sigma = tmp_path / f"p.{ending}", np.arange(300.0)
+    longitude, latitude, height = POINTS.T
+    if ending == "gpkg":
+        write(path, wkb(POINTS), [sigma], ["Sigma"], geometry_type="Point Z", crs="EPSG:4326")
+    elif ending == "parquet":
+        parquet.write_table(table({"lon": longitude, "lat": latitude, "h": height, "sigma": sigma}), path)
+    else:
+        np.savetxt(path, np.column_stack([POINTS, sigma]), delimiter=";", header="lon;lat;h;SIGMA", comments="")
+    file = PointFile(path, None, Vertical(ellipsoid=True))
+    (points,) = file.parts(with_sigma=True)
+    np.testing.assert_allclose(points, np.column_stack([POINTS, sigma]))
+    assert next(file.parts()).shape == (300, 3)
