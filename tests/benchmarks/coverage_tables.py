@@ -126,7 +126,7 @@ def noise() -> None:
     """Means over all scenes with noise in both images."""
     header("noise", *FIGURES)
     scenes = DEVELOPMENT + WORLDVIEW
-    for share in (0, 0.1, 0.2, 0.3):
+    for share in (0, 0.1, 0.3):
         found = []
         for scene in scenes:
             interval = {"coverage": 0.9, "calibration": without(scene, "satellite")}
