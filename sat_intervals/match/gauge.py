@@ -36,9 +36,8 @@ def pairs_of(thresholds: ThresholdSweep) -> list[tuple[int, int]]:
 
 def at_levels(config: Config, high: float, low: float, quantile: float | None) -> Config:
     """Return settings whose intervals are cut at two levels, whatever the coverage, and without local ranges."""
-    rows = [
-        {"coverage": coverage, "high": high, "edge": high, "low": low, "quantile": quantile} for coverage in COVERAGES
-    ]
+    level = {"high": high, "edge": high, "low": low, "quantile": quantile}
+    rows = [level | {"coverage": coverage} for coverage in COVERAGES]
     constant = Calibration.model_validate({"name": "constant", "key": key_of(config), "levels": rows})
     interval = Interval(coverage=Decimal(str(COVERAGES[0])), calibration=constant)
     disparity = config.disparity.model_copy(update={"local": False, "grid": None, "around": None})

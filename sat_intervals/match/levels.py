@@ -99,17 +99,20 @@ def choose(pool: Pool, sweep: ThresholdSweep, coverage: float) -> tuple[Levels, 
     high = _level(table[:, LOW if few[HIGH] and borrows else HIGH], sweep.high, coverage)
     edge = _level(table[:, EDGE], sweep.high, coverage)
     most = float(sweep.low[-1])
-    low: tuple[float, float | None] | None
-    if few[LOW] and borrows:
-        low = most if high is None else high, _USUAL_QUANTILE
-    else:
-        low = _best(table, sweep.low, coverage)
+    own = _best(table, sweep.low, coverage)
+    low = (most if high is None else high, _USUAL_QUANTILE) if few[LOW] and borrows else own
     found = zip(_CLASSES.values(), pixels, (high, edge, low), strict=True)
     missed = [f"{words} does not reach it at any level" for words, number, level in found if number and level is None]
     level, quantile = low or (most, QUANTILES[int(np.argmax(table[-1, LOW:, INSIDE]))])  # it comes nearest
     high, edge = (float(sweep.high[-1]) if one is None else one for one in (high, edge))
-    edge = None if sweep.are_one else edge
-    levels = Levels(coverage=coverage, high=high, edge=edge, low=level, quantile=quantile, reached=not missed)
+    levels = Levels(
+        coverage=coverage,
+        high=high,
+        edge=None if sweep.are_one else edge,
+        low=level,
+        quantile=quantile,
+        reached=not missed,
+    )
     return levels, notes + missed
 
 
@@ -179,9 +182,8 @@ def interval_score(fields: np.ndarray, coverage: float) -> float:
 def expected(table: np.ndarray, sweep: ThresholdSweep, levels: Levels) -> dict[str, float]:
     """Coverage of all and by class, widths in pixels and interval score with given levels; NaN without pixels."""
     assert levels.coverage is not None
-    classes = {"high": at_level(table[:, HIGH], sweep.high, levels.high)}
-    if levels.edge is not None:
-        classes["edge"] = at_level(table[:, EDGE], sweep.high, levels.edge)
+    edge = {} if levels.edge is None else {"edge": at_level(table[:, EDGE], sweep.high, levels.edge)}
+    classes = {"high": at_level(table[:, HIGH], sweep.high, levels.high)} | edge
     classes["low"] = at_level(table[:, LOW + QUANTILES.index(levels.quantile)], sweep.low, levels.low)
     both = np.sum(list(classes.values()), axis=0)
     if not both[COUNTS:].sum():

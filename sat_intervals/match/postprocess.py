@@ -73,9 +73,9 @@ class Filtered(NamedTuple):
     low: np.ndarray | None
     written: np.ndarray
     deviation: np.ndarray
-    below: np.ndarray = _EMPTY
-    above: np.ndarray = _EMPTY
-    edge: np.ndarray = _EMPTY
+    below: np.ndarray
+    above: np.ndarray
+    edge: np.ndarray
 
     @property
     def half(self) -> HalfWidths:
@@ -167,11 +167,10 @@ def filter_rows(rows: RawRows, scale: ConfidenceScale, config: Config) -> Filter
     elif config.has_planes:
         disparity = smoothed(disparity, kept, config)
     written = searched if config.products.keep_rejected else kept
-    filtered = Filtered(disparity, lower, upper, confidence, validity, low, written, deviation)
+    half = (_EMPTY,) * 3
     if config.fits and config.has_coverage:
         half = half_widths(Refined(disparity, deviation), lower, upper, kept)
-        filtered = filtered._replace(**half._asdict())
-    return filtered
+    return Filtered(disparity, lower, upper, confidence, validity, low, written, deviation, *half)
 
 
 def widened(

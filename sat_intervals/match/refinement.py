@@ -87,7 +87,5 @@ def bounds_of_both(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return bounds by a factor for each pixel, or for all, inside the search range."""
     search, scale = config.disparity, np.float32(factor)
-    return (
-        np.maximum(disparity - scale * half.below, search.minimum),
-        np.minimum(disparity + scale * half.above, search.maximum),
-    )
+    lower, upper = disparity - scale * half.below, disparity + scale * half.above
+    return np.maximum(lower, search.minimum), np.minimum(upper, search.maximum)
