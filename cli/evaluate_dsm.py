@@ -65,7 +65,7 @@ details_options = gathered(
     click.option("--classes", type=FILE, help="With --dsm: raster of whole numbers, such as land cover, in any CRS."),
     click.option(
         "--within",
-        type=float,
+        type=click.FloatRange(min=0),
         metavar="METRES",
         help="With --dsm: errors up to this count as found in the completeness; default 1.",
     ),

@@ -194,7 +194,7 @@ def surface_options(dsm_help: str, others: str, *of_surfaces: str) -> Decorator:
         ),
         click.option(
             "--reference-sigma",
-            type=float,
+            type=click.FloatRange(min=0),
             metavar="METRES",
             help="With --dsm: standard deviation of the errors of points without a column sigma; default 0.",
         ),

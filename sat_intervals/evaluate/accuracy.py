@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sat_intervals.evaluate.metrics import Intervals, share
-from sat_intervals.kernels.label_noise import TrueErrors, true_errors
+from sat_intervals.kernels.label_noise import MOST, TrueErrors, true_errors
 from sat_intervals.match.histogram import Histogram
 
 BLOCKS = 4  # parts of the ground along each of its sides: errors within one are correlated
@@ -128,9 +128,11 @@ def coverage_of(cells: Heights) -> tuple[float | None, float | None]:
     if cells.height.size < _FEWEST:
         return None, None
     coverage = cells.true_errors().within(1)
-    variance = coverage * (1 - coverage) / cells.height.size
-    others = [cells.of(cells.block != block).true_errors().within(1) for block in np.unique(cells.block)]
-    if len(others) > 1:  # the jackknife
+    variance = _binomial(coverage * cells.height.size, cells.height.size)
+    cells = cells.of(np.arange(0, cells.height.size, -(-cells.height.size // MOST)))  # the same for each block
+    blocks = np.unique(cells.block)
+    if blocks.size > 1:  # the jackknife
+        others = [cells.of(cells.block != block).true_errors().within(1) for block in blocks]
         variance = max(variance, (len(others) - 1) * float(np.var(others)))
     return coverage, float(np.sqrt(variance))
 
@@ -141,11 +143,17 @@ def coverage_deviation(counts: np.ndarray, inside: np.ndarray) -> float | None:
     if not counts.size:
         return None
     coverage = inside.sum() / counts.sum()
-    variance = coverage * (1 - coverage) / counts.sum()
+    variance = _binomial(inside.sum(), counts.sum())
     if counts.size > 1:
         between = np.square(inside - coverage * counts).sum() / counts.sum() ** 2
         variance = max(variance, between * counts.size / (counts.size - 1))
     return float(np.sqrt(variance))
+
+
+def _binomial(inside: float, count: float) -> float:
+    """Return the variance of a share; that of few cases, all inside, is not 0."""
+    middle = (inside + 1) / (count + 2)
+    return float(middle * (1 - middle) / count)
 
 
 class Ranking:

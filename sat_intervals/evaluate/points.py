@@ -6,7 +6,7 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.point_files import PointFile
-from sat_intervals.kernels.registration import ACROSS, POINTS, REACH, Blocks, block_side, put_together
+from sat_intervals.kernels.registration import ACROSS, REACH, Blocks, block_side, every_nth, put_together
 from sat_intervals.raster import Georeferencing, Projection, Vertical, read_layers, read_tags
 from sat_intervals.raster.georeferencing import horizontal_name
 from sat_intervals.tiling import Window
@@ -29,6 +29,7 @@ def read_points(
     for part in file.parts(with_sigma=True):
         longitude, latitude, height = file.frame.to_ellipsoid(*part[:, :3].T)
         points = np.column_stack([*projection.place(longitude, latitude), height, part[:, 3]])
+        points = points[np.isfinite(points[:, :2]).all(axis=1)]  # others are too far for the projection
         inside = cells_of(points, place).T
         chosen = ((inside >= 0) & (inside < shape)).all(axis=1) & (random.random(len(points)) < share)
         found = np.concatenate([found, points[chosen]])
@@ -63,7 +64,8 @@ def blocks_of(surface: Path, points: np.ndarray, place: Georeferencing, shape: t
     counts = np.bincount(numbers.ravel(), minlength=groups.shape[1])
     parts = []
     for group in np.argsort(-counts, kind="stable")[: ACROSS**2]:
-        chosen = np.flatnonzero(numbers.ravel() == group)[:POINTS]
+        chosen = np.flatnonzero(numbers.ravel() == group)
+        chosen = chosen[every_nth(chosen.size)]
         ends = cells[:, chosen].min(axis=1).tolist(), (cells[:, chosen].max(axis=1) + 1).tolist()
         window = Window.around(*ends).grown(REACH + 1, REACH + 1).clipped(Window(0, 0, *shape))
         x, y, height, _ = points[chosen].T

@@ -13,7 +13,7 @@ import numpy as np
 # Standard deviations of the mixture in half widths; steps towards its shares: more of them fit the noise.
 _SCALES = np.geomspace(0.02, 60, 28)
 _STEPS = 300
-_MOST = 2048  # errors that are used
+MOST = 2048  # errors that are used
 
 
 class TrueErrors(NamedTuple):
@@ -36,7 +36,7 @@ class TrueErrors(NamedTuple):
 
 def true_errors(errors: np.ndarray, noise: np.ndarray) -> TrueErrors:
     """Return the distribution of true errors from measured ones and deviations of their noise: ``(n,)``."""
-    every = slice(None, None, -(-errors.size // _MOST))
+    every = slice(None, None, -(-errors.size // MOST))
     deviation = np.hypot(_SCALES, noise[every, np.newaxis])
     likelihood = np.exp(-0.5 * np.square(errors[every, np.newaxis] / deviation)) / deviation
     likelihood = np.maximum(likelihood, 1e-300)

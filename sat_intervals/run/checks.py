@@ -63,7 +63,8 @@ def check_tiles(config: Config, region: Window, ranges: LocalRanges | None = Non
         return
     grid = Grid(region, config.tiles.size)
     height, width = grid.tile(0, 0).core.height, grid.tile(0, 0).core.width
-    largest = max((narrowed(ranges, tile.core, config) for tile in grid), key=lambda one: one.disparity.count)
+    tiles_of = (narrowed(ranges, tile.core, config) for tile in grid)
+    largest = max(tiles_of, key=lambda one: one.disparity.count) if ranges else config
     most = config.cluster.workers or usable_cores()
     tiles, strips = min(most, len(grid)), min(most, -(-region.height // BLOCK))
     check_memory(
