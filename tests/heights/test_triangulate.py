@@ -324,8 +324,8 @@ def test_surface_command__is_match_and_dsm_and_resumes(tmp_path, monkeypatch):
     out, steps = tmp_path / "one", tmp_path / "steps"
     command = ["surface", *images, str(out), *sensors, *search, "--resolution", "1"]
     (tmp_path / "heights.yaml").write_text(
-        "{name: city, coverage: 0.9, registered: true, surface: {CELL: 9 m}, "
-        "classes: [{below: null, margin: 1.0, cells: 99}]}"
+        "{version: 2, name: city, coverage: 0.9, registered: true, surface: {CELL: 9 m}, "
+        "classes: [{relief_below: null, half_width_below: null, margin: 1.0, cells: 99}]}"
     )
     for option, value, message in (
         ("--crs", "4326", "is not a map in metres"),
