@@ -138,10 +138,11 @@ class Console:
 
     def say_images(self, swept: dict[str, Any]) -> None:
         """Print the shifts and likeness of the images of a sweep."""
-        images = Table("image", "row", "column", "likeness", box=None, pad_edge=False)
+        images = Table("image", "row", "column", "left", "likeness", box=None, pad_edge=False)
         for one in swept["images"]:
-            images.add_row(Path(one["path"]).name, *(f"{part:+.2f}" for part in one["shift"]), _likeness(one["alike"]))
-        self.say("shifts of the models (px), and likeness to the other images (-1 to 1)")
+            shift = (f"{part:+.2f}" for part in one["shift"])
+            images.add_row(Path(one["path"]).name, *shift, _known(one["left"]), _known(one["alike"]))
+        self.say("shifts of the models and what they leave (px), and likeness to the other images (-1 to 1)")
         self._terminal.print(images)
 
     def summary_of_many(self, report: dict[str, Any], out: Path) -> None:
@@ -193,8 +194,8 @@ def lines_of_grid(swept: dict[str, Any]) -> dict[str, str]:
     }
 
 
-def _likeness(alike: float | None) -> str:
-    return "-" if alike is None else f"{alike:.2f}"
+def _known(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
 
 
 def _share(part: int, whole: int) -> str:

@@ -111,10 +111,27 @@ def pair_options(command: Command, images: Decorator = image_options) -> Command
 
 many_options = partial(pair_options, images=gathered("pair", _of_many, _IMAGES, *_IMAGE_OPTIONS))
 
-heights_option = click.option(
-    "--heights",
-    type=float,
-    nargs=2,
-    metavar="MIN MAX",
-    help="Three images or more: heights of the ground, metres; default: found from the images.",
+
+def _ground(*, extent: tuple[float, float, float, float] | None, heights: tuple[float, float] | None) -> dict[str, Any]:
+    return {"extent": extent, "heights": heights}
+
+
+# The command gets ``ground``: arguments of `surface`.
+ground_options = gathered(
+    "ground",
+    _ground,
+    expert_option(
+        "--extent",
+        type=float,
+        nargs=4,
+        metavar="LEFT BOTTOM RIGHT TOP",
+        help="Three images or more: part of the map that the surface covers, metres; default: what two images see.",
+    ),
+    click.option(
+        "--heights",
+        type=float,
+        nargs=2,
+        metavar="MIN MAX",
+        help="Three images or more: heights of the ground, metres; default: found from the images.",
+    ),
 )

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from sat_intervals.cli.dsm import grid_options, side_of
-from sat_intervals.cli.images import PairArguments, heights_option, many_options
+from sat_intervals.cli.images import PairArguments, ground_options, many_options
 from sat_intervals.cli.matching import SettingsArguments, search_options
 from sat_intervals.cli.options import Grouped, json_option, log_options, say_json
 
@@ -19,13 +19,20 @@ if TYPE_CHECKING:
 @search_options
 @many_options
 @grid_options
-@heights_option
+@ground_options
 @click.option(
     "--memory", metavar="SIZE", help="Memory of a worker, such as 4GB: tiles are made smaller until one fits."
 )
 @json_option
 @log_options
-def plan(pair: PairArguments, settings: SettingsArguments, memory: str | None, as_json: bool, **grid: Any) -> None:
+def plan(
+    pair: PairArguments,
+    settings: SettingsArguments,
+    ground: dict[str, Any],
+    memory: str | None,
+    as_json: bool,
+    **grid: Any,
+) -> None:
     """Estimate tiles, memory, disk and time of matching LEFT and RIGHT, or of the surface of three images or more.
 
     The time comes from a sample matched at the centre, or elsewhere if there is no data. Options and settings are those
@@ -37,7 +44,7 @@ def plan(pair: PairArguments, settings: SettingsArguments, memory: str | None, a
     config = settings.load(2 + len(pair.more))
     limit = parse_memory(memory) if memory else None
     with Console(quiet=as_json) as console:
-        made = _planned(pair, config, grid, memory=limit, progress=console.progress)
+        made = _planned(pair, config, grid | ground, memory=limit, progress=console.progress)
         if made.sweep:
             console.say_images(made.sweep)
     if as_json:

@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from sat_intervals.cli.dsm import calibration_option, cell_options, say_surface
-from sat_intervals.cli.images import PairArguments, heights_option, many_options
+from sat_intervals.cli.images import PairArguments, ground_options, many_options
 from sat_intervals.cli.matching import RunArguments, SettingsArguments, run_options, search_options
 from sat_intervals.cli.options import FILE, Grouped, sensor_options
 from sat_intervals.cli.rectify import raw_options, say_rectified
@@ -21,7 +21,7 @@ from sat_intervals.cli.rectify import raw_options, say_rectified
 @raw_options
 @cell_options
 @calibration_option("--height-calibration")
-@heights_option
+@ground_options
 @click.option("--ortho", is_flag=True, help="Three images or more: write OUT/ortho.tif, their median on the surface.")
 @run_options
 def surface(
@@ -30,7 +30,7 @@ def surface(
     sensor_files: list[tuple[Path, ...]],
     raw: dict[str, Any],
     cells: dict[str, Any],
-    heights: tuple[float, float] | None,
+    ground: dict[str, Any],
     ortho: bool,
     settings: SettingsArguments,
     run: RunArguments,
@@ -63,7 +63,7 @@ def surface(
             config,
             **cells,
             **raw,
-            heights=heights,
+            **ground,
             ortho=ortho,
             sensors=sensor_files[0] if sensor_files else (),
             window=pair.window,

@@ -74,6 +74,13 @@ class HeightCalibration(CalibrationFile):
         if different := differences(self.surface, key, "the surface"):
             raise ConfigError(f"calibration {self.name} belongs to other surfaces, {different[0]}: {_MAKE_ONE}")
 
+    def tagged(self, tags: Mapping[str, str], cell: float) -> dict[str, str]:
+        """Return the tags of a surface with its margins, from those without; raise if it belongs to other surfaces."""
+        self.check_surface(surface_key(tags, cell))
+        kept = {name: tag for name, tag in tags.items() if name != "ALPHA"}
+        own = {"COVERAGE": f"{self.coverage:g}", "CALIBRATION": f"{self.name} {self.sha256}"}
+        return kept | own | {"REGISTERED": "yes" if self.registered else "no"}
+
 
 def _by_relief(classes: tuple[HeightClass, ...]) -> list[tuple[float | None, list[HeightClass]]]:
     """Return the limits of relief, each with its classes."""

@@ -12,7 +12,7 @@ import numpy as np
 from sat_intervals.config import HeightCalibration
 from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.point_cloud import Cells, PointCloud
-from sat_intervals.kernels.conformal import AROUND, Margins, relief_of, widened
+from sat_intervals.kernels.conformal import AROUND, Margins, outwards, relief_of
 from sat_intervals.kernels.gridding import BOUNDED, CONFIDENCE, COUNT, HEIGHT, LOWER, UPPER, WEIGHT
 from sat_intervals.match.histogram import Histogram
 from sat_intervals.products import SURFACE
@@ -41,6 +41,7 @@ def strips(
 def _calibrated(parts: Iterator[Strip], calibration: HeightCalibration) -> Iterator[Strip]:
     """Yield strips with calibrated intervals, which depend on the heights of two rows above and below."""
     strip: Strip | None = next(parts)
+    margins = Margins(*calibration.table())
     above = np.empty((0, 0), np.float32)
     while strip is not None:
         following = next(parts, None)
@@ -48,7 +49,8 @@ def _calibrated(parts: Iterator[Strip], calibration: HeightCalibration) -> Itera
         near = [above] * bool(above.size) + [heights] + ([following[1][0, :AROUND]] if following else [])
         relief = relief_of(np.concatenate(near))[len(above) :][: len(heights)]
         above = heights[-AROUND:].copy()
-        calibrate(strip[1], relief, calibration)
+        height, lower, upper = strip[1][:3]
+        strip[1][1:3] = margins.widened(height, lower, upper, relief)
         yield strip
         strip = following
 
@@ -126,8 +128,8 @@ def fused(gathered: Sequence[np.ndarray]) -> np.ndarray:
         upper = np.where(several & meeting, middle + half, np.fmax.reduce(uppers))
     bands = {
         "height": np.fmin(np.fmax(height, lower), upper),
-        "height_lower": _outwards(lower, -np.inf),
-        "height_upper": _outwards(upper, np.inf),
+        "height_lower": outwards(lower, -np.inf),
+        "height_upper": outwards(upper, np.inf),
         "count": np.where(count > 0, count, np.nan),
         "confidence": _mean(weights, confidences),
         "agreement": np.where(several, meeting, np.nan),
@@ -143,13 +145,6 @@ def _mean(weights: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.asarray(np.nansum(weights * values, axis=0) / total)
 
 
-def calibrate(bands: np.ndarray, relief: np.ndarray, calibration: HeightCalibration) -> None:
-    """Widen or narrow the intervals of cells by the margins of a calibration, in place."""
-    height, lower, upper = bands[:3].astype(np.float64)
-    lower, upper = widened(height, lower, upper, Margins(*calibration.table()).of((upper - lower) / 2, relief))
-    bands[1], bands[2] = _outwards(lower, -np.inf), _outwards(upper, np.inf)
-
-
 def without_poor_cells(bands: np.ndarray, max_width: float | None, min_confidence: float | None) -> int:
     """Set the cells of wider intervals or lower confidence to NaN, in place; return their number."""
     height, lower, upper, _, confidence, _ = bands
@@ -161,13 +156,6 @@ def without_poor_cells(bands: np.ndarray, max_width: float | None, min_confidenc
     poor &= np.isfinite(height)
     bands[:, poor] = np.nan
     return int(poor.sum())
-
-
-def _outwards(bound: np.ndarray, end: float) -> np.ndarray:
-    """Round a bound to float32, towards ``end``."""
-    single = bound.astype(np.float32)
-    inside = single > bound if end < 0 else single < bound
-    return np.where(inside, np.nextafter(single, np.float32(end)), single)
 
 
 class CellCounts:

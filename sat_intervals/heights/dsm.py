@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.config import Calibration, Interval, surface_key
+from sat_intervals.config import Calibration, Interval
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.cells import CellCounts, strips
 from sat_intervals.heights.choices import SurfaceChoices
@@ -173,13 +173,7 @@ def surface_tags(
     matched = [one.calibration for one in intervals if one and isinstance(one.calibration, Calibration)]
     if matched:
         tags["DISPARITY_CALIBRATION"] = ", ".join(sorted({f"{one.name} {one.sha256}" for one in matched}))
-    calibration = choices.calibration
-    if calibration is None:
-        return tags
-    calibration.check_surface(surface_key(tags, cell))
-    tags.pop("ALPHA", None)
-    tags |= {"COVERAGE": f"{calibration.coverage:g}", "CALIBRATION": f"{calibration.name} {calibration.sha256}"}
-    return tags | {"REGISTERED": "yes" if calibration.registered else "no"}
+    return choices.calibration.tagged(tags, cell) if choices.calibration else tags
 
 
 def _grid_of(path: Path, given: str | None) -> tuple[Cells, str]:

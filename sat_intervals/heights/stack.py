@@ -42,6 +42,8 @@ _LOCAL = 9
 _FLAT = 7, 2.0
 # Steps of least squares, and pixels of a step that are enough.
 _STEPS, _ENOUGH = 8, 0.01
+# Pixels that a shift leaves from which an image gets a plane, and the largest condition of its equations.
+_MUCH, _SOLVABLE = 0.3, 1e4
 # Reduction from which a level is coarse, and pixels of such a level that a shift has at least to be believed.
 _COARSE, _TOLD = 4, 0.5
 
@@ -159,11 +161,13 @@ def sample_cores(whole: Window, most: int = _SAMPLES[0]) -> list[Window]:
 class Sample(NamedTuple):
     """Images resampled to the surface of a core.
 
+    place: row and column of its middle, in sizes of the grid from the grid's middle.
     alike: ``(images, rows, columns)`` float32: grey values made alike, NaN where not usable.
     sure: bool ``(rows, columns)``.
     cell: ``(images, 2, 2)``: how rows and columns in an image change along rows and columns of cells.
     """
 
+    place: np.ndarray
     alike: np.ndarray
     sure: np.ndarray
     cell: np.ndarray
@@ -177,7 +181,8 @@ def sample(stack: Stack, core: Window) -> Sample:
     alike = np.stack([_alike(ortho(view, there)) for view, there in zip(views, places, strict=True)])
     cell = np.stack([[np.diff(there, axis=axis).mean(axis=(0, 1)) for axis in (0, 1)] for there in places])
     smooth = maximum_filter(disparity, _FLAT[0]) - minimum_filter(disparity, _FLAT[0]) <= _FLAT[1]
-    return Sample(alike.astype(np.float32), surface.sure(_UNSURE[1]) & smooth, cell.swapaxes(1, 2))
+    place = np.array([core.row + core.height / 2, core.column + core.width / 2]) / stack.ground.shape - 0.5
+    return Sample(place, alike.astype(np.float32), surface.sure(_UNSURE[1]) & smooth, cell.swapaxes(1, 2))
 
 
 def samples_of(stack: Stack, each: Each, *, is_coarse: bool) -> list[Sample]:
@@ -187,8 +192,22 @@ def samples_of(stack: Stack, each: Each, *, is_coarse: bool) -> list[Sample]:
     return [found[i] for i in range(len(cores))]
 
 
-def aligned(stack: Stack, samples: Sequence[Sample]) -> tuple[np.ndarray, np.ndarray]:
-    """Return shifts ``(images, 2)`` that add to positions, pixels with mean 0, and correlations with the other images.
+class Fits(NamedTuple):
+    """What adds to the positions of images, in pixels; the mean of all images is 0.
+
+    shift: ``(images, 2)``: rows and columns.
+    slope: ``(images, 2, 2)``: rows and columns more at the last row, and at the last column, of the grid than at the
+        first.
+    left: ``(images,)``: what is left on sample blocks, root mean square; NaN of images that show too little.
+    """
+
+    shift: np.ndarray
+    slope: np.ndarray
+    left: np.ndarray
+
+
+def aligned(stack: Stack, samples: Sequence[Sample]) -> np.ndarray:
+    """Return shifts ``(images, 2)`` that add to positions, pixels with mean 0.
 
     Least squares between each image and the median of the others on sample blocks of the surface. A shift for each
     image is what Fraser and Hanley (2003) found that RPC models need.
@@ -205,10 +224,50 @@ def aligned(stack: Stack, samples: Sequence[Sample]) -> tuple[np.ndarray, np.nda
     reduction = np.array(stack.ground.reductions)[:, None]
     is_fine = np.linalg.norm(shifts, axis=1, keepdims=True) >= _TOLD * (reduction >= _COARSE)
     shifts = np.where(is_fine, shifts, 0.0) * reduction
-    return shifts - shifts.mean(axis=0), _correlations(samples)
+    return np.asarray(shifts - shifts.mean(axis=0))
 
 
-def _correlations(samples: Sequence[Sample]) -> np.ndarray:
+def tilted(stack: Stack, samples: Sequence[Sample], shifts: np.ndarray) -> Fits:
+    """Return planes of the images of which shifts ``(images, 2)`` leave much, and what is left of all.
+
+    Planes are what Fraser and Hanley (2003) need where the attitude drifts. They are least squares over all blocks.
+    """
+    reduction, places = np.array(stack.ground.reductions), np.array([[1.0, *one.place] for one in samples])
+    planes = np.zeros((len(stack.images), 3, 2))  # in the middle, and along rows and columns; reduced pixels
+    planes[:, 0] = shifts / reduction[:, None]
+    sums, left = _left_by(planes, samples, places)
+    before = left * reduction
+    for _ in range(_STEPS):
+        whole = np.einsum("si,snkl,sj->nikjl", places, sums[..., :2], places).reshape(-1, 6, 6)
+        right = np.einsum("si,snk->nik", places, sums[..., 2]).reshape(-1, 6, 1)
+        step, solvable = np.zeros_like(planes), np.linalg.cond(whole) < _SOLVABLE
+        step[solvable] = np.linalg.solve(whole[solvable], right[solvable]).reshape(-1, 3, 2)
+        planes += step
+        sums, left = _left_by(planes, samples, places)
+        if np.abs(step).max() <= _ENOUGH:
+            break
+    needed = (before > _MUCH) & (left * reduction < before / 2)
+    planes = planes * reduction[:, None, None]
+    planes[~needed, 0], planes[~needed, 1:] = shifts[~needed], 0.0
+    planes -= planes.mean(axis=0)
+    return Fits(planes[:, 0], planes[:, 1:], np.where(needed, left * reduction, before))
+
+
+def _left_by(planes: np.ndarray, samples: Sequence[Sample], places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the equations of all blocks beyond planes, ``(blocks, images, 2, 3)``, and what planes leave of images.
+
+    That is the root mean square of what each block alone finds, weighted by what its grey values tell.
+    """
+    sums = np.array([_equations(one, at @ planes) for one, at in zip(samples, places, strict=True)])
+    solvable = np.linalg.det(sums[..., :2]) > 0
+    total, weight = np.zeros(sums.shape[:2]), np.where(solvable, np.trace(sums[..., :2], axis1=2, axis2=3) / 2, 0.0)
+    steps = np.linalg.solve(sums[solvable, :, :2], sums[solvable, :, 2:])
+    total[solvable] = (steps * sums[solvable, :, 2:]).sum(axis=(1, 2))
+    known = weight.sum(axis=0)
+    return sums, np.sqrt(total.sum(axis=0) / np.where(known > 0, known, np.nan))
+
+
+def correlations(samples: Sequence[Sample]) -> np.ndarray:
     """Return the correlation of each image with the median of the others, NaN where it shows too few cells."""
     products = []
     for one in samples:

@@ -35,6 +35,15 @@ class Margins(NamedTuple):
             found[own] = margins[np.searchsorted(limits, half_width[own], side="right")]
         return found + (self.factor - 1) * half_width
 
+    def widened(
+        self, height: np.ndarray, lower: np.ndarray, upper: np.ndarray, relief: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return bounds, moved by the margins of their cells and rounded outwards to float32; any shape."""
+        ends = (end.astype(np.float64) for end in (height, lower, upper))
+        height, lower, upper = ends
+        lower, upper = widened(height, lower, upper, self.of((upper - lower) / 2, relief))
+        return outwards(lower, -np.inf), outwards(upper, np.inf)
+
 
 def relief_of(height: np.ndarray) -> np.ndarray:
     """Return the range of the known heights in 5 x 5 cells around each: ``(rows, columns)``, NaN without any."""
@@ -77,3 +86,10 @@ def widened(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Move both bounds outwards by margins, or inwards by negative ones, never past the height; any shape."""
     return np.minimum(lower - margin, height), np.maximum(upper + margin, height)
+
+
+def outwards(bound: np.ndarray, end: float) -> np.ndarray:
+    """Round a bound to float32, towards ``end``."""
+    single = bound.astype(np.float32)
+    inside = single > bound if end < 0 else single < bound
+    return np.where(inside, np.nextafter(single, np.float32(end)), single)

@@ -144,4 +144,7 @@ def sweep(planes, starts, sizes, moves, pairs, share, steps, costs, seen):
             for c in range(columns):
                 costs[r, c, h] = level[r, c]
         if h == heights // 2:
-            seen[:] = usable
+            for n in range(count):  # an assignment between arrays would take five seconds longer to compile
+                for r in range(rows):
+                    for c in range(columns):
+                        seen[n, r, c] = usable[n, r, c]

@@ -56,6 +56,13 @@ class GroundViews:
         """Return the views with rows and columns added to all positions, ``(images, 2)``."""
         return replace(self, places=self.places + shifts[:, None, None, None, :])
 
+    def tilted(self, slopes: np.ndarray) -> "GroundViews":
+        """Return the views with planes added to positions: ``slopes`` are pixels along the whole grid, see `Fits`."""
+        known = zip(self.places.shape[2:4], self.first, self.shape, strict=True)
+        row, column = (BLOCK * (np.arange(count) + first) / size - 0.5 for count, first, size in known)
+        planes = row[:, None, None] * slopes[:, None, None, 0] + column[:, None] * slopes[:, None, None, 1]
+        return replace(self, places=self.places + planes[:, None])
+
     def corners(self, image: int, block: tuple[int, int], disparities: np.ndarray) -> np.ndarray:
         """Return ``(n, 2, 2, 2)``: positions of a block's corners in an image, reduced, at disparities ``(n,)``."""
         row, column = (one - first for one, first in zip(block, self.first, strict=True))

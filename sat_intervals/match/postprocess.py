@@ -227,23 +227,21 @@ def regularized(
 
 
 def postprocess_strips(strips: Iterable[RawRows], scale: ConfidenceScale, config: Config) -> Iterator[products.Bands]:
-    """Final bands of a region from its strips, from the top; a row is finished once the halo below it is read."""
+    """Final bands of a region from its strips, from the top; a row is finished once the halo below it is read.
+
+    With `halo` rows, inside the region, above and below a strip its `inner_rows` have the bits of the whole region.
+    """
     for rows, first, last in with_halo(strips, halo(config)):
         yield postprocess_rows(rows, first, last, scale, config)
 
 
-def postprocess_strip(
-    pieces: Iterable[RawRows], above: int, height: int, scale: ConfidenceScale, config: Config
-) -> Iterator[products.Bands]:
-    """Final bands of a strip of ``height`` rows, the same in every bit as those of the whole region.
-
-    ``pieces``, from the top, are the strip with `halo` rows, inside the region, above and below it: ``above`` above.
-    """
+def inner_rows(pieces: Iterable[Rows], above: int, height: int) -> Iterator[Rows]:
+    """Yield the ``height`` rows below the first ``above`` of a record that is given piece by piece."""
     row = -above
-    for final in postprocess_strips(pieces, scale, config):
-        rows = len(final.validity)
+    for piece in pieces:
+        rows = len(piece[0])
         if row + rows > 0 and row < height:
-            yield cut_rows(final, max(0, -row), min(rows, height - row))
+            yield cut_rows(piece, max(0, -row), min(rows, height - row))
         row += rows
 
 

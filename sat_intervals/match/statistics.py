@@ -34,7 +34,8 @@ class Tally:
         self._agreement += np.count_nonzero(bands.agreement == 0), np.count_nonzero(bands.agreement == 1)
         width = (bands.upper - bands.lower)[bands.valid]
         width = np.rint(width[np.isfinite(width)] / np.float32(_WIDTH_STEP)).astype(np.int32)
-        self._widths += np.bincount(width, minlength=self._widths.size)
+        widest = self._widths.size - 1  # bounds that a calibration of heights has moved may be farther apart
+        self._widths += np.bincount(np.minimum(width, widest), minlength=self._widths.size)
 
     def counts(self) -> dict[str, list[list[int]]]:
         """Return all counts, each with its place; `merge` adds them."""

@@ -9,7 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from sat_intervals.config import Config, load_config, resolved
+from sat_intervals.config import Config, HeightCalibration, load_config, resolved
 from sat_intervals.errors import RunError
 from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.match.ground import GroundViews, ground_of, report_of_ground
@@ -43,7 +43,7 @@ class Swept:
 
     images: by the names of their records.
     asked: digest of all that its geometry was found from.
-    level: what its heights are above, in words.
+    level: what its heights are above, in words; ``calibration``: margins that move their bounds.
     report: shifts and other figures, for ``run.json``.
     """
 
@@ -51,6 +51,7 @@ class Swept:
     asked: str
     level: str
     report: dict[str, Any]
+    calibration: HeightCalibration | None = None
 
 
 @dataclass(frozen=True)
@@ -117,7 +118,8 @@ class Job:
     @property
     def name(self) -> str:
         """Return the name of the run: a digest of all that decides the bytes of its files."""
-        return digest(self.manifest | {"all": self.settings})
+        margins = {"margins": self.swept.calibration.sha256} if self.swept and self.swept.calibration else {}
+        return digest(self.manifest | {"all": self.settings} | margins)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -138,11 +140,9 @@ class Job:
                 write_manifest(home_of(self.out), self.manifest)
             ranges = self.prepared.ranges and self.prepared.ranges.report()
             self.store.write(ONCE, _RANGE, of=origin_of(self.inputs), ranges=ranges, **self.prepared.known())
-            if self.prepared.ground:
-                assert self.swept is not None
+            if self.prepared.ground and (swept := self.swept):
                 figures, arrays = report_of_ground(self.prepared.ground)
-                meta: dict[str, Any] = {"figures": figures, "report": self.swept.report}
-                self.store.write(ONCE, _GROUND, numbered(arrays), of=self.swept.asked, **meta)
+                self.store.write(ONCE, _GROUND, numbered(arrays), of=swept.asked, figures=figures, report=swept.report)
         except OSError as error:
             remedy = "make room, check its rights or choose another folder" if self.store.folder.is_local else _REMOTE
             raise StoreError(f"{self.store.folder} cannot be used: {error.strerror or error}: {remedy}") from error

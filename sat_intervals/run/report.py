@@ -47,15 +47,18 @@ def tags_of(job: Job) -> dict[str, str]:
 
 def _tags_of_surface(job: Job, swept: Swept) -> dict[str, str]:
     """Return the tags of the surface of a sweep, see `surface_tags`; the size of tiles is not in them."""
-    interval, images = job.config.interval, len(job.images)
-    tags = {
-        "SOFTWARE": f"sat-intervals {version('sat-intervals')}",
-        "RUNS": swept.asked,
-        "HEIGHTS": f"above {swept.level}",
-    }
-    tags |= {"IMAGES": f"{images}", "INTERVAL": "cost curve of many images"}
+    software = {"SOFTWARE": f"sat-intervals {version('sat-intervals')}"}
+    tags = {"RUNS": swept.asked, "HEIGHTS": f"above {swept.level}", "IMAGES": f"{len(job.images)}"}
+    tags |= tags_of_sweep(job.config)
+    cell = job.left.georeferencing.affine.a
+    return software | (swept.calibration.tagged(tags, cell) if swept.calibration else tags)
+
+
+def tags_of_sweep(config: Config) -> dict[str, str]:
+    """Return the tags of the intervals of a sweep, see `surface_key`."""
+    interval, tags = config.interval, {"INTERVAL": "cost curve of many images"}
     if interval and interval.coverage is not None:
-        calibration = calibration_of(job.config)
+        calibration = calibration_of(config)
         name = f"{calibration.name} {calibration.sha256}"
         return tags | {"COVERAGE": str(interval.coverage), "DISPARITY_CALIBRATION": name}
     return tags | ({"ALPHA": str(interval.alpha)} if interval else {})

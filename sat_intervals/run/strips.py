@@ -1,23 +1,33 @@
 """Finish strips of a run on workers: final bands, compressed as parts of the files, and overviews, as a binary tree."""
 
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 
-from sat_intervals.config import Config
+from sat_intervals.config import Config, HeightCalibration
 from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.kernels.conformal import AROUND, Margins, relief_of
 from sat_intervals.match import postprocess, refinement
 from sat_intervals.match.around import with_agreement
 from sat_intervals.match.ground import GroundViews
 from sat_intervals.match.memory import STRIP_PIXELS
-from sat_intervals.match.postprocess import ConfidenceScale, RawRows, halo, postprocess_strip
+from sat_intervals.match.postprocess import (
+    ConfidenceScale,
+    RawRows,
+    cut_rows,
+    halo,
+    inner_rows,
+    postprocess_strips,
+    with_halo,
+)
 from sat_intervals.match.refinement import pixel_windows, pixels_of
 from sat_intervals.match.statistics import Tally
 from sat_intervals.prepare.local import given_disparities
+from sat_intervals.products import Bands
 from sat_intervals.progress import Progress
 from sat_intervals.raster import BLOCK, codec_versions, compressed, factors, halved, read_views
 from sat_intervals.run.job import Job
@@ -128,7 +138,7 @@ def finish_strip(job: Job, of: str, key: PartKey, scale: ConfidenceScale) -> str
         check_codecs(job, of)
         region = job.store.grid.region
         search = job.config.disparity
-        margin = halo(job.config)
+        margin = halo(job.config) + (AROUND if job.swept and job.swept.calibration else 0)
         first, last = key[1] * BLOCK, min(region.height, (key[1] + 1) * BLOCK)
         top, bottom = max(0, first - margin), min(region.height, last + margin)
         shape, extra = (last - first, region.width), job.config.extra_bands
@@ -137,8 +147,10 @@ def finish_strip(job: Job, of: str, key: PartKey, scale: ConfidenceScale) -> str
         tally, row = Tally(search.count, search.minimum), 0
         counts = list[np.ndarray]()
         try:
-            pieces = raw_rows(job, job.config, top, bottom, counts)
-            for final in postprocess_strip(pieces, first - top, shape[0], scale, job.config):
+            finals = postprocess_strips(raw_rows(job, job.config, top, bottom, counts), scale, job.config)
+            if job.swept and job.swept.calibration:
+                finals = _widened(finals, job.swept.calibration, job.ground())
+            for final in inner_rows(finals, first - top, shape[0]):
                 rows = slice(row, row := row + len(final.validity))
                 if given is not None:
                     final = with_agreement(final, given[rows])
@@ -152,6 +164,18 @@ def finish_strip(job: Job, of: str, key: PartKey, scale: ConfidenceScale) -> str
             intervals = _heights(intervals, count, job.ground())
         _write(job, of, key, [intervals, validity], counts=tally.counts())
     return None
+
+
+def _widened(finals: Iterable[Bands], calibration: HeightCalibration, ground: GroundViews | None) -> Iterator[Bands]:
+    """Yield the final bands of a sweep with bounds that are moved by the margins of a calibration of heights."""
+    assert ground is not None
+    margins = Margins(*calibration.table())
+    for rows, first, last in with_halo(finals, AROUND):
+        heights = ground.step * np.where(rows.valid, rows.disparity, np.nan)
+        final, relief = cut_rows(rows, first, last), relief_of(heights)[first:last]
+        middle, low, high = (ground.step * band.astype(np.float64) for band in final[:3])
+        lower, upper = (end / ground.step for end in margins.widened(middle, low, high, relief))
+        yield final._replace(lower=lower.astype(np.float32), upper=upper.astype(np.float32))
 
 
 def _heights(bands: np.ndarray, count: np.ndarray, ground: GroundViews | None) -> np.ndarray:

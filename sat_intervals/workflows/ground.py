@@ -11,13 +11,16 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.models import SensorImage
 from sat_intervals.heights.point_cloud import Cells
 from sat_intervals.heights.stack import (
+    Fits,
     Stack,
     Surface,
     aligned,
+    correlations,
     level_config,
     ranges_for,
     samples_of,
     surface_of,
+    tilted,
 )
 from sat_intervals.heights.views import common_cells, undulation_at, views_of, with_pairs
 from sat_intervals.match.ground import BLOCK, GroundViews
@@ -45,7 +48,7 @@ class GroundPlan:
 
     sensors: the images that are used; ``left_out``: those whose shift could not be found.
     ranges: None of a scene too small for coarse levels.
-    shifts: ``(images, 2)`` rows and columns, pixels; ``alike``: correlation of each image with the others.
+    fits: what adds to positions in the images; ``alike``: correlation of each image with the others.
     """
 
     sensors: list[SensorImage]
@@ -54,7 +57,7 @@ class GroundPlan:
     ground: GroundViews
     config: Config
     ranges: LocalRanges | None
-    shifts: np.ndarray
+    fits: Fits
     alike: np.ndarray
 
 
@@ -65,6 +68,7 @@ class _Search:
         assert isinstance(config.cost, Sweep)
         self.sensors, self.projection, self.config, self.each = list(sensors), projection, config, each
         self.cost, self.shifts, self.alike = config.cost, np.zeros((len(sensors), 2)), np.ones(len(sensors))
+        self.slopes, self.left = np.zeros((len(sensors), 2, 2)), np.full(len(sensors), np.nan)
 
     def stack(self, cells: Cells, factor: int, heights: tuple[float, float]) -> Stack:
         """Return the stack of a level; its step is half a pixel of parallax of its widest pair, if it is not given."""
@@ -79,13 +83,18 @@ class _Search:
         return Stack(images, replace(ground, base=base, step=step), level_config(self.config, first, last), None)
 
     def align(self, stack: Stack, *, is_coarse: bool) -> Stack:
-        """Find shifts, in rounds while they are large; return the stack with them."""
-        for _ in range(_ROUNDS):
-            found, self.alike = aligned(stack, samples_of(stack, self.each, is_coarse=is_coarse))
-            stack = self._moved(stack, found)
-            if np.abs(found).max() < _SMALL * min(stack.ground.reductions):
+        """Find shifts, in rounds while they are large, at last planes; return the stack with them."""
+        for is_last in [False] * (_ROUNDS - 1) + [True]:
+            samples = samples_of(stack, self.each, is_coarse=is_coarse)
+            found, self.alike = aligned(stack, samples), correlations(samples)
+            if is_last or np.abs(found).max() < _SMALL * min(stack.ground.reductions):
                 break
-        return stack
+            stack = self._moved(stack, found)
+        if is_coarse:
+            return self._moved(stack, found)
+        found, self.slopes, self.left = tilted(stack, samples, found)
+        stack = self._moved(stack, found)
+        return replace(stack, ground=stack.ground.tilted(self.slopes))
 
     @property
     def unlike(self) -> np.ndarray:
@@ -152,8 +161,8 @@ def found_ground(
         search = _Search(kept, projection, config, each)
     config = config.model_copy(update={"disparity": stack.config.disparity})
     stack = _on_grid(stack, cells, grid) if grid else stack
-    cells, shifts, alike = grid or cells, search.shifts, search.alike
-    return GroundPlan(search.sensors, left_out, cells, stack.ground, config, stack.ranges, shifts, alike)
+    fits = Fits(search.shifts, search.slopes, search.left)
+    return GroundPlan(search.sensors, left_out, grid or cells, stack.ground, config, stack.ranges, fits, search.alike)
 
 
 def _on_grid(stack: Stack, cells: Cells, grid: Cells) -> Stack:

@@ -1,13 +1,14 @@
 """Make a surface model of many raw images at once: plane sweep and semi-global matching in object space."""
 
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from sat_intervals.config import Config, Sweep, resolved
+from sat_intervals.config import Config, HeightCalibration, Sweep, resolved, surface_key
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.match.ground import GroundViews
@@ -27,6 +28,7 @@ from sat_intervals.run.each import EachOnWorkers
 from sat_intervals.run.inputs import describe_inputs
 from sat_intervals.run.job import Job, Swept, job_of, kept_ground, remove_tiles
 from sat_intervals.run.pair import complete_before, match_and_assemble
+from sat_intervals.run.report import tags_of_sweep
 from sat_intervals.run.state import check_folder, outputs_of, read_report
 from sat_intervals.store.lock import locked
 from sat_intervals.store.manifest import digest
@@ -49,9 +51,11 @@ class Wanted(NamedTuple):
     resolution: float | Path
     crs: str | None = None
     geoid: Path | None = None
+    extent: tuple[float, float, float, float] | None = None
     heights: tuple[float, float] | None = None
     models: Sequence[str | Path | None] = ()
     ortho: bool = False
+    calibration: HeightCalibration | None = None
 
 
 @dataclass(frozen=True)
@@ -69,7 +73,8 @@ class Asked:
     @property
     def request(self) -> str:
         """Return a digest of all that is asked for."""
-        return digest([self.digest, self.config.model_dump(mode="json", exclude={"cluster", "preset"})])
+        calibration = self.wanted.calibration and self.wanted.calibration.sha256
+        return digest([self.digest, self.config.model_dump(mode="json", exclude={"cluster", "preset"}), calibration])
 
 
 Geometry = tuple[GroundViews, dict[str, Any]]
@@ -115,6 +120,10 @@ def asked_of(images: Sequence[Image], out: Path, config: Config, wanted: Wanted,
         raise SatIntervalsError("a range of disparities is for two images: leave it out, or give heights")
     _check_images(images, wanted)
     grid, cell, crs, _ = checked_cells(wanted.resolution, wanted.crs, None, wanted.geoid)
+    if wanted.extent:
+        grid = _cells_of(wanted.extent, grid, cell)
+    if wanted.calibration:
+        wanted.calibration.check_surface(surface_key(tags_of_sweep(config) | {"RUNS": "this"}, cell))
     check_folder(out, overwrite=overwrite, names=outputs_of(config))
     named = {f"image_{number}": image for number, image in enumerate(images, start=1)}
     inputs = describe_inputs(named, config, {})
@@ -133,6 +142,20 @@ def asked_of(images: Sequence[Image], out: Path, config: Config, wanted: Wanted,
         "files": [file and identity(str(file), {}) for file in files],
     }
     return Asked(named, config, wanted._replace(crs=crs), cell, grid, inputs, digest(plain(decisive)))
+
+
+def _cells_of(extent: tuple[float, float, float, float], grid: "Cells | None", cell: float) -> "Cells":
+    """Return the cells of an extent: left, bottom, right and top on the map."""
+    from sat_intervals.heights.point_cloud import Cells
+
+    left, bottom, right, top = extent
+    if grid or not (left < right and bottom < top):
+        raise SatIntervalsError(
+            f"extent is {left:g} {bottom:g} {right:g} {top:g}: give left, bottom, right and top on the map, in metres, "
+            "and no raster whose grid is taken"
+        )
+    first, last = (math.floor(left / cell), math.floor(bottom / cell)), (math.ceil(right / cell), math.ceil(top / cell))
+    return Cells(cell * first[0], cell * last[1], cell, last[1] - first[1], last[0] - first[0])
 
 
 def _check_images(images: Sequence[Image], wanted: Wanted) -> None:
@@ -186,7 +209,14 @@ def found_geometry(asked: Asked, each: Each) -> Geometry:
     search = plan.config.disparity
     ends = [plan.ground.base + plan.ground.step * end for end in (search.minimum, search.maximum)]
     of_images = [
-        {"path": one.image.path, "model": one.file, "shift": plan.shifts[n].round(3).tolist(), "alike": plan.alike[n]}
+        {
+            "path": one.image.path,
+            "model": one.file,
+            "shift": plan.fits.shift[n].round(3).tolist(),
+            "slope": plan.fits.slope[n].round(3).tolist(),
+            "left": plan.fits.left[n],
+            "alike": plan.alike[n],
+        }
         for n, one in enumerate(plan.sensors)
     ]
     return plan.ground, plain(
@@ -219,6 +249,7 @@ def geometry_job(asked: Asked, out: Path, geometry: Geometry, region: Window | N
         asked.digest,
         str(asked.wanted.geoid or "the WGS 84 ellipsoid"),
         figures | {"request": asked.request},
+        asked.wanted.calibration,
     )
     config, cells = with_range(asked.config, figures), figures["cells"]
     place = north_up(figures["crs"], cells["left"], cells["top"], cells["resolution"])

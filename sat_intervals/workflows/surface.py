@@ -1,6 +1,7 @@
 """Images to a surface model: of two an epipolar pair is matched and its points are gridded, more go by a sweep."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -45,6 +46,7 @@ def surface(
     radius: float | None = None,
     geoid: str | Path | None = None,
     choices: SurfaceChoices | None = None,
+    extent: tuple[float, float, float, float] | None = None,
     heights: tuple[float, float] | None = None,
     ortho: bool = False,
     sensors: Sequence[str | Path | None] = (),
@@ -79,11 +81,14 @@ def surface(
         RPC models of the images; of an epipolar pair left and right model and grid, see `set_geometry`. By default the
         models that belong to raw images, and what `rectify` has noted of its pair.
     radius, choices
-        Of two images, as for `make_surface`.
+        Of two images, as for `make_surface`; of more, ``choices`` may have a calibration only.
     dem, altitude, resolution_of
         Of two raw images, as for `rectify`; the heights of ``dem`` refer to ``geoid``.
     window
         Of an epipolar pair: region of the left image.
+    extent
+        Of three images or more: left, bottom, right and top of the surface on its map, metres; by default the ground
+        that two images see.
     heights
         Of three images or more: lowest and highest height of the ground, metres above ``geoid`` or the ellipsoid; by
         default found.
@@ -111,15 +116,15 @@ def surface(
     config, out, geoid = load_config(config, images=len(opened)), Path(out), Path(geoid) if geoid else None
     resolution = Path(resolution) if isinstance(resolution, str) else resolution
     choices, raw = choices or SurfaceChoices(), {"dem": dem, "altitude": altitude, "resolution_of": resolution_of}
-    of_points = None if choices == SurfaceChoices() else choices
+    of_points = None if replace(choices, calibration=None) == SurfaceChoices() else choices
     if len(opened) < 2:
         raise SatIntervalsError(f"images: {len(opened)} given, a surface needs two or more")
     how: dict[str, Any] = {"overwrite": overwrite, "progress": progress}
     if len(opened) > 2:
         check_absent(raw | {"window": window, "radius": radius, "a choice of points": of_points}, "two images")
-        wanted = Wanted(resolution, crs, geoid, heights, sensors, ortho)
+        wanted = Wanted(resolution, crs, geoid, extent, heights, sensors, ortho, choices.calibration)
         return surface_of_many(opened, out, config, wanted, keep_tiles=keep_tiles, **how)
-    check_absent({"heights": heights, "ortho": ortho or None}, "three images or more")
+    check_absent({"extent": extent, "heights": heights, "ortho": ortho or None}, "three images or more")
     check_cost(config)
     cells = {"resolution": resolution, "crs": crs, "radius": radius, "geoid": geoid}
     check_cells(cells, choices, resolved(config).interval)

@@ -11,8 +11,9 @@ from sat_intervals.match.postprocess import (
     RawRows,
     cut_rows,
     halo,
+    inner_rows,
     postprocess_rows,
-    postprocess_strip,
+    postprocess_strips,
 )
 from sat_intervals.products import NO_DISPARITY, REGULARIZED
 
@@ -48,7 +49,7 @@ def fitted_rows() -> RawRows:
     "sections",
     [{}, {"median": {"size": 7}, "regularization": {"depth": 4}}, {"median": None}, {"preset": "satellite"}],
 )
-def test_postprocess_strip__equals_the_whole_region_in_every_bit(sections):
+def test_inner_rows__of_a_strip_equal_those_of_the_whole_region_in_every_bit(sections):
     search = {"minimum": MINIMUM, "maximum": MINIMUM + COUNT - 1}
     config = load_config({"preset": "paper", "disparity": search, "cross_check": {"tolerance": 9}} | sections)
     config = at_levels(config, 0.5, 100, 0.9) if config.fits else config
@@ -59,7 +60,7 @@ def test_postprocess_strip__equals_the_whole_region_in_every_bit(sections):
         last = min(first + 32, ROWS)
         top, bottom = max(0, first - margin), min(ROWS, last + margin)
         pieces = (cut_rows(raw, row, min(row + 11, bottom)) for row in range(top, bottom, 11))
-        parts = list(postprocess_strip(pieces, first - top, last - first, scale, config))
+        parts = list(inner_rows(postprocess_strips(pieces, scale, config), first - top, last - first))
         for name in ("disparity", "lower", "upper", "confidence", "validity"):
             found = np.concatenate([getattr(part, name) for part in parts])
             np.testing.assert_array_equal(found, getattr(whole, name)[first:last], err_msg=name)

@@ -13,7 +13,9 @@ from raw import raw_pair
 from sweeps import CRS, OPTIONS, WORDS
 
 from sat_intervals import SatIntervalsError, surface
+from sat_intervals.config import load_height_calibration
 from sat_intervals.demo import PIXEL, make_scene
+from sat_intervals.kernels.conformal import Margins, relief_of
 from sat_intervals.match.ground import BLOCK
 from sat_intervals.products import SURFACE
 from sat_intervals.raster import Georeferencing, north_up, read_layers, write_layer
@@ -86,6 +88,34 @@ def test_surface_of_many__finds_the_heights_on_a_part_of_a_large_grid(sweep, tmp
     assert np.isfinite(away).sum() > 0.9 * np.isfinite(expected[0]).sum()
     found[inside] = np.nan
     assert np.isnan(found).all()
+
+
+def test_surface_of_many__covers_an_extent_and_moves_bounds_by_margins(sweep, tmp_path):
+    margins, truth = tmp_path / "heights.yaml", sweep.out.parent / "truth.tif"
+    result = invoke("calibrate", "--dsm", sweep.out / "dsm.tif", "--reference", truth, "--output", margins)
+    assert result.exit_code == 0, result.output
+    cells = sweep.report["sweep"]["cells"]
+    left, top, side = cells["left"], cells["top"], cells["resolution"]
+    extent = left + 50 * side, top - 150 * side, left + 169.5 * side, top - 49.5 * side
+    plain, calibrated = (surface(sweep.images, tmp_path / "plain", **OPTIONS, extent=extent), None)
+    command = "surface", *sweep.images, tmp_path / "calibrated", *WORDS, "--height-calibration", margins
+    result = invoke(*command, "--extent", *extent)
+    assert result.exit_code == 0, result.output
+    calibrated = json.loads((tmp_path / "calibrated" / "run.json").read_text())
+    own = {"left": left + 50 * side, "top": top - 49 * side, "resolution": side, "rows": 101, "columns": 120}
+    assert plain["sweep"]["cells"] == calibrated["sweep"]["cells"] == pytest.approx(own)
+    before, after = (read_layers(tmp_path / name / "dsm.tif") for name in ("plain", "calibrated"))
+    np.testing.assert_array_equal(after[[0, 3, 4]], before[[0, 3, 4]])
+    calibration = load_height_calibration(margins)
+    expected = Margins(*calibration.table()).widened(*before[:3], relief_of(before[0]))
+    np.testing.assert_allclose(after[1:3], expected, atol=1e-4)
+    assert np.unique((after - before)[1].round(3)).size > 2
+    half = calibrated["counts"]["median_interval_width"] * calibrated["sweep"]["step"] / 2
+    assert half == pytest.approx(np.nanmedian(after[2] - after[1]) / 2, abs=0.02)
+    with rasterio.open(tmp_path / "calibrated" / "dsm.tif") as dataset:
+        assert dataset.tags()["CALIBRATION"] == f"heights {calibration.sha256}"
+    refused((*command, "--resolution", 2 * PIXEL), "belongs to other surfaces, CELL is")
+    refused((*command[:-2], "--extent", 9, 0, 1, 5), "extent is 9 0 1 5: give left")
 
 
 @pytest.mark.process

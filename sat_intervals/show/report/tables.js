@@ -128,11 +128,12 @@ function showValidity() {
 function showSweep() {
   const { images, left_out: out, step, crs, cells } = run.sweep;
   find("search-title").textContent = "Images and heights";
-  const rows = images.map(({ path, shift, alike }) => [path.split("/").at(-1), ...shift.map((part) => fixed(part, 2)), alike === null ? "-" : fixed(alike, 2)]);
+  const rows = images.map(({ path, shift, left, alike }) =>
+    [path.split("/").at(-1), ...[...shift, left, alike].map((value) => value === null ? "-" : fixed(value, 2))]);
   find("search").append(
     element("p", {}, `Heights ${quantity(search.minimum)} to ${quantity(search.maximum)} m, every ${fixed(step, 2)} m, ` +
       `for cells of ${short(cells.resolution)} m in ${crs}. Left out: ${out.length ? out.join(", ") : "no image"}.`),
-    table(["image", "shift of its model, rows of the image", "columns", "likeness to the others (\u22121 to 1)"], rows),
+    table(["image", "shift of its model, rows of the image", "columns", "what they leave", "likeness to the others (\u22121 to 1)"], rows),
   );
 }
 
