@@ -1,6 +1,6 @@
 """Match many images coarsely: a surface of a level, the ranges of the next one, and shifts of the images."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -237,7 +237,7 @@ def tilted(stack: Stack, samples: Sequence[Sample], shifts: np.ndarray) -> Fits:
     planes[:, 0] = shifts / reduction[:, None]
     sums, left = _left_by(planes, samples, places)
     before = left * reduction
-    for _ in range(_STEPS):
+    for _ in range(_STEPS if (before > _MUCH).any() else 0):
         whole = np.einsum("si,snkl,sj->nikjl", places, sums[..., :2], places).reshape(-1, 6, 6)
         right = np.einsum("si,snk->nik", places, sums[..., 2]).reshape(-1, 6, 1)
         step, solvable = np.zeros_like(planes), np.linalg.cond(whole) < _SOLVABLE
@@ -271,8 +271,7 @@ def correlations(samples: Sequence[Sample]) -> np.ndarray:
     """Return the correlation of each image with the median of the others, NaN where it shows too few cells."""
     products = []
     for one in samples:
-        for n, own in enumerate(one.alike):
-            middle = median_of(np.delete(one.alike, n, axis=0))
+        for n, (own, middle) in enumerate(zip(one.alike, medians_of_others(one.alike), strict=True)):
             seen = one.sure & np.isfinite(own) & np.isfinite(middle)
             of_cells = (own * middle)[seen].sum(), (own**2)[seen].sum(), (middle**2)[seen].sum(), seen.sum()
             products.append((n, *of_cells))
@@ -293,8 +292,7 @@ def _equations(one: Sample, shifts: np.ndarray) -> np.ndarray:
         ]
     )
     result = np.zeros((len(moved), 2, 3))
-    for n, own in enumerate(moved):
-        middle = median_of(np.delete(moved, n, axis=0))
+    for n, (own, middle) in enumerate(zip(moved, medians_of_others(moved), strict=True)):
         along = np.stack(np.gradient(middle), axis=-1)
         seen = one.sure & np.isfinite(own) & np.isfinite(along).all(axis=-1)
         slope, miss = along[seen] @ to_cells[n], (middle - own)[seen]
@@ -323,6 +321,22 @@ def _alike(values: np.ndarray) -> np.ndarray:
     deviation = np.sqrt(np.maximum(uniform_filter(away**2, _LOCAL) / share, 0))
     scale = deviation + 0.05 * (deviation[usable].mean() if usable.any() else 1.0) + 1e-9
     return np.where(usable, away / scale, np.nan)
+
+
+def medians_of_others(values: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield for each item of the first axis the median of the others, without NaN; where it is itself NaN, NaN."""
+    ordered, count = np.sort(values, axis=0), np.isfinite(values).sum(axis=0) - 1  # of the others
+    # without a value the order is that of all, one further from the value on
+    ends = [
+        [
+            np.take_along_axis(ordered, np.clip(place + more, 0, len(values) - 1)[np.newaxis], axis=0)[0]
+            for more in (0, 1)
+        ]
+        for place in ((count - 1) // 2, count // 2)
+    ]
+    for own in values:
+        low, high = (np.where(here < own, here, following) for here, following in ends)
+        yield np.where(np.isfinite(own), (low + high) / 2, np.nan)
 
 
 def median_of(values: np.ndarray) -> np.ndarray:

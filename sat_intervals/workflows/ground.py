@@ -35,7 +35,7 @@ _DOUBTFUL = 0.1
 # Share of the cells of the coarsest level beyond the range of heights at each end; its margin: steps, and a share.
 _BEYOND, _MARGIN = 0.005, (3, 0.15)
 # Rounds of matching and shifts at a level, and the shifts after which there is no other, in pixels of the level.
-_ROUNDS, _SMALL = 2, 0.2
+_ROUNDS, _SMALL = 2, 0.4
 # Share of the median correlation below which an image is not like the others.
 _UNLIKE = 0.4
 # Images that a sweep needs.
