@@ -60,11 +60,11 @@ class Heights(NamedTuple):
 class Accuracy:
     """Figures of a class of cells; ``nominal`` is the coverage that intervals are to reach, None if unknown.
 
-    ``within``: metres of error up to which a height counts as found.
+    ``within``: metres of error up to which a height counts as found; ``is_noisy``: whether references have errors.
     """
 
-    def __init__(self, nominal: float | None, within: float) -> None:
-        self._nominal, self._within = nominal, within
+    def __init__(self, nominal: float | None, within: float, *, is_noisy: bool = False) -> None:
+        self._nominal, self._within, self._is_noisy = nominal, within, is_noisy
         self._count = self._missing = self._near = 0
         self._blocks = np.zeros((2, BLOCKS**2))  # intervals, and those that contain their reference
         self._sum = self._squares = 0.0
@@ -84,7 +84,7 @@ class Accuracy:
         self._intervals.add(np.maximum(bounded.outside, 0), 2 * bounded.half_width)
         for total, blocks in zip(self._blocks, (bounded.block, bounded.block[bounded.outside <= 0]), strict=True):
             total += np.bincount(blocks, minlength=total.size)
-        if bounded.sigma.any():
+        if self._is_noisy:
             self._noisy.append(bounded)
 
     def report(self) -> dict[str, Any]:

@@ -39,7 +39,7 @@ def read_points(
     found[:, 3] = np.where(np.isfinite(found[:, 3]), found[:, 3], sigma or 0.0)
     if not len(found):
         raise SatIntervalsError(f"no point of {reference} falls on {surface}: give a reference of the same place")
-    if (least := found[:, 3].min()) < 0:
+    if not (least := found[:, 3].min()) >= 0:
         raise SatIntervalsError(f"sigma of {reference} is {least:g}: give standard deviations in metres")
     return found
 

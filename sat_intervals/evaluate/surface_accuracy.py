@@ -33,8 +33,8 @@ _SAMPLES, _AT_ONCE = 4000, 256  # samples of a profile, and of those read at a t
 class _Ranges:
     """Figures by ranges of a value between limits."""
 
-    def __init__(self, limits: tuple[float, ...], *judging: Any) -> None:
-        self._kinds = {ends: Accuracy(*judging) for ends in pairwise(limits)}
+    def __init__(self, limits: tuple[float, ...], **judging: Any) -> None:
+        self._kinds = {ends: Accuracy(**judging) for ends in pairwise(limits)}
 
     def add(self, cells: Heights, values: np.ndarray, of_missing: np.ndarray) -> None:
         for (first, last), kind in self._kinds.items():
@@ -51,10 +51,10 @@ class _Ranges:
 class _Figures:
     """Figures of all cells and of classes; ``judging``: what `Accuracy` takes."""
 
-    def __init__(self, *judging: Any) -> None:
+    def __init__(self, **judging: Any) -> None:
         self._judging = judging
-        self._whole, self._ranking = Accuracy(*judging), Ranking()
-        self._slopes, self._halves = _Ranges(SLOPES, *judging), _Ranges(HALF_WIDTHS, *judging)
+        self._whole, self._ranking = Accuracy(**judging), Ranking()
+        self._slopes, self._halves = _Ranges(SLOPES, **judging), _Ranges(HALF_WIDTHS, **judging)
         self._classes: dict[int, Accuracy] = {}
         self._has_slopes = False
 
@@ -73,7 +73,7 @@ class _Figures:
             found, absent = values[known], values[missing]
             either = np.concatenate([found, absent])
             for number in np.unique(either[np.isfinite(either)]):
-                kind = self._classes.setdefault(int(number), Accuracy(*self._judging))
+                kind = self._classes.setdefault(int(number), Accuracy(**self._judging))
                 kind.add(cells.of(found == number), int((absent == number).sum()))
 
     def report(self) -> dict[str, Any]:
@@ -137,7 +137,9 @@ def evaluate_surface(
     if classes is not None:
         read_place(Path(classes))
     moved, warnings = registered(given) if registers else (given, [])
-    before, figures = Accuracy(nominal, within), _Figures(nominal, within)
+    is_noisy = given.points is not None and bool(given.points[:, 3].any())
+    judging: dict[str, Any] = {"nominal": nominal, "within": within, "is_noisy": is_noisy}
+    before, figures = Accuracy(**judging), _Figures(**judging)
     for window in tiles(given):
         figures.add(moved, window, None if classes is None else Path(classes))
         if moved is not given:

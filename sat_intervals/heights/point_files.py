@@ -37,7 +37,8 @@ class PointFile:
         check_file(path, "give a file of points")
         self._path, ending = path, path.suffix.lower()
         is_cloud = ending in (".las", ".laz")
-        crs_of, self._parts = (_crs_of_las, _las) if is_cloud else (_crs_of_table, _of_table)
+        crs_of = _crs_of_las if is_cloud else _crs_of_table
+        self._parts = _las if is_cloud else _of_table
         with _reading(path):
             own = crs_of(path)
         self.frame = Frame(str(path), crs or own or surface[0], vertical, surface[1])
@@ -48,7 +49,7 @@ class PointFile:
         A fourth column, if asked for, has the column ``sigma`` of a table, NaN without.
         """
         with _reading(self._path):
-            for part in self._parts(self._path):
+            for part in self._parts(self._path, with_sigma):
                 # other heights are no-data values
                 places = part[:, :3]
                 known = np.isfinite(places).all(axis=1) & is_ground(places[:, 2] * self.frame.unit)
@@ -128,11 +129,11 @@ def _crs_of_table(path: Path) -> str | None:
         return "EPSG:4326" if _columns(path, names, geometry)[1] else crs
 
 
-def _of_table(path: Path) -> Iterator[np.ndarray]:
+def _of_table(path: Path, with_sigma: bool) -> Iterator[np.ndarray]:
     """Yield points and sigma; the height is that of the geometry, unless constant or missing beside one of heights."""
     with _table(path) as (names, geometry, *_):
         chosen, _ = _columns(path, names, geometry)
-        noise = [name for name in names if name.strip().lower() == "sigma"][:1]
+        noise = [name for name in names if with_sigma and name.strip().lower() == "sigma"][:1]
     uses_column = None
     with _table(path, [*chosen, *noise]) as (*_, batches):
         for batch in batches:
@@ -167,7 +168,7 @@ def _crs_of_las(path: Path) -> str | None:
     return None if crs is None else str(crs.to_wkt())
 
 
-def _las(path: Path) -> Iterator[np.ndarray]:
+def _las(path: Path, _: bool) -> Iterator[np.ndarray]:
     """Yield points but those marked as noise or withheld; sigma is unknown."""
     import laspy
 

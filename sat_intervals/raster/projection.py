@@ -171,7 +171,9 @@ def _check_ellipsoid(name: str, whole: CRS, vertical: Vertical, level: str) -> N
     """Raise if heights refer to a geoid, or to nothing that is known."""
     datum = whole.sub_crs_list[1].name if whole.is_compound else ""
     if datum and "ellipsoid" not in datum.lower() and (not level or level.endswith("ellipsoid")):
-        raise SatIntervalsError(f"{name} has heights of {datum}: give the grid of this geoid with --geoid")
+        raise SatIntervalsError(
+            f"{name} has heights of {datum}: give the grid of this geoid with --geoid, to sat-intervals reference"
+        )
     if vertical.ellipsoid or datum or len(whole.axis_info) > 2 or level.endswith("ellipsoid"):
         return
     if level:

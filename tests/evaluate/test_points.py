@@ -70,6 +70,16 @@ def test_evaluate_surface__a_column_counts_before_the_option(tmp_path):
     assert report["all"]["coverage"] > 0.9
 
 
+def test_evaluate_surface__counts_exact_points_beside_noisy_ones_of_other_tiles(tmp_path, monkeypatch):
+    monkeypatch.setattr("sat_intervals.evaluate.comparison._TILE", 64)
+    height = np.full((1, 256), 10.0)
+    model = write_surface(tmp_path / "dsm.tif", height, height - 1, height + 1, TAGS)
+    place = np.arange(256) + 0.5
+    sigma = np.where(place < 64, 0.5, 0)
+    points = write_points(tmp_path / "p.csv", place, 0 * place + 0.5, np.where(place < 128, 10, 20), sigma=sigma)
+    assert evaluate_surface(model, points, registers=False)["all"]["coverage"] == pytest.approx(0.5, abs=0.05)
+
+
 def test_evaluate_surface__moves_points_to_the_surface(tmp_path):
     row, column = np.indices((150, 160)).astype(np.float64)
     random = np.random.default_rng(3)

@@ -127,3 +127,10 @@ def test_point_file__yields_a_column_sigma_if_asked_for(ending, tmp_path):
     (points,) = file.parts(with_sigma=True)
     np.testing.assert_allclose(points, np.column_stack([POINTS, sigma]))
     assert next(file.parts()).shape == (300, 3)
+
+
+def test_point_file__reads_no_sigma_that_is_not_asked_for(tmp_path):
+    path = tmp_path / "p.csv"
+    path.write_text("longitude,latitude,height,sigma\n1,2,3,fine\n4,5,6,poor\n")
+    (points,) = PointFile(path, None, Vertical(ellipsoid=True)).parts()
+    np.testing.assert_allclose(points, [[1, 2, 3], [4, 5, 6]])
