@@ -27,6 +27,7 @@ class Histogram:
     def __init__(self, first: int, last: int, steps: int) -> None:
         self._first, self._steps = first, steps
         self._counts = np.zeros((last - first) * steps + 1, np.int64)
+        self._ends = self._counts.size, 0  # of the part with counts: the whole takes long to look through
 
     def add(self, values: np.ndarray) -> None:
         """Count values; none may be NaN."""
@@ -36,10 +37,11 @@ class Histogram:
             least = int(places.min())
             counts = np.bincount(places - least)
             self._counts[least : least + counts.size] += counts
+            self._ends = min(self._ends[0], least), max(self._ends[1], least + counts.size)
 
     def _present(self) -> tuple[np.ndarray, np.ndarray]:
         """Values that occur, ascending, and their counts."""
-        places = np.flatnonzero(self._counts)
+        places = self._ends[0] + np.flatnonzero(self._counts[slice(*self._ends)])
         return self._first + places / self._steps, self._counts[places]
 
     def median(self) -> float | None:

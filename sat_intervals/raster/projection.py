@@ -2,13 +2,12 @@
 
 from dataclasses import dataclass
 from functools import partial
+from math import floor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pyproj import CRS, Proj, Transformer
-from pyproj.aoi import AreaOfInterest
-from pyproj.database import query_utm_crs_info
 from pyproj.exceptions import CRSError, ProjError
 
 from sat_intervals.errors import SatIntervalsError, check_file
@@ -29,11 +28,7 @@ def utm_of(longitude: float, latitude: float) -> str:
     longitude = between_180(longitude)
     if not _UTM[0] <= latitude <= _UTM[1]:
         return "EPSG:32661" if latitude > 0 else "EPSG:32761"
-    area = AreaOfInterest(longitude, latitude, longitude, latitude)
-    zones = query_utm_crs_info(datum_name="WGS 84", area_of_interest=area)
-    if not zones:
-        raise SatIntervalsError(f"no UTM zone at longitude {longitude:.2f}, latitude {latitude:.2f}: give a CRS")
-    return f"EPSG:{zones[0].code}"
+    return f"EPSG:{(32600 if latitude >= 0 else 32700) + floor((longitude + 180) / 6) % 60 + 1}"
 
 
 def grid_mapping(place: Georeferencing) -> dict[str, Any]:

@@ -60,7 +60,7 @@ def digest(content: Any) -> str:
     def kept(there: dict[str, Any]) -> dict[str, Any]:
         return {key: value for key, value in there.items() if key not in (_IGNORED, PLACE)}
 
-    same = json.dumps(json.loads(as_json(content), object_hook=kept), sort_keys=True)
+    same = json.dumps(json.loads(as_json(content, indent=None), object_hook=kept), sort_keys=True)
     return hashlib.sha256(same.encode()).hexdigest()[:32]
 
 

@@ -24,7 +24,7 @@ from sat_intervals.heights.dsm import make_surface
 from sat_intervals.heights.geometry import Geometry
 from sat_intervals.heights.lattice import Lattice
 from sat_intervals.products import OPEN_ABOVE, RANGE_INCOMPLETE, SURFACE
-from sat_intervals.raster import Projection, north_up, write_layer
+from sat_intervals.raster import Projection, north_up, utm_of, write_layer
 from sat_intervals.raster.projection import transformed
 
 TO_DEGREES = Transformer.from_crs("EPSG:32631", "EPSG:4326", always_xy=True)
@@ -443,6 +443,12 @@ def test_make_surface__refuses_a_geoid_that_ends_before_the_points(tmp_path):
     out = write_points(tmp_path / "a", [0.5, 0.6, 0.7, 200_000], [-0.5] * 4, [100.0] * 4)
     with pytest.raises(SatIntervalsError, match=r"does not cover the region of .*: give one that covers them"):
         surface_of([out], tmp_path, geoid=write_geoid(tmp_path / "geoid.tif", 49.5))
+
+
+def test_utm_of__numbers_zones_from_the_date_line_and_leaves_poles_to_ups():
+    places = (-180, 1), (7.2, 43.6), (151.2, -33.9), (179.9, -1), (367.2, 43.6), (10, 85), (10, -81)
+    codes = 32601, 32632, 32756, 32760, 32632, 32661, 32761
+    assert [utm_of(*place) for place in places] == [f"EPSG:{code}" for code in codes]
 
 
 @pytest.mark.parametrize(
