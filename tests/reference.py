@@ -172,11 +172,12 @@ def etas(eta_max, eta_step):
 def ambiguity(volume, eta_max, eta_step, cost_span):
     """Section 4: candidates within eta * span of the minimum or impossible, over all etas; 0 where empty."""
     result = np.zeros(volume.shape[:2], np.int64)
+    fractions = etas(eta_max, eta_step)
     for r, c in np.ndindex(result.shape):
         searched = volume[r, c] != IMPOSSIBLE_COST
         if searched.any():
             above = volume[r, c] - volume[r, c].min()
-            for eta in etas(eta_max, eta_step):
+            for eta in fractions:
                 # above <= eta * span, multiplied by eta's denominator: integers on both sides
                 near = above * eta.denominator <= eta.numerator * cost_span
                 result[r, c] += np.count_nonzero(near | ~searched)
@@ -712,8 +713,8 @@ def settings_of(scene, alpha="0.9", eta_max="0.7", eta_step="0.01", refine=True,
     cost_span = span_of(scene)
     weights = np.zeros(0, np.uint16)
     if eta_max is not None:
-        levels = [math.floor(eta * cost_span) for eta in etas(eta_max, eta_step)]
-        weights = np.array([sum(x <= level for level in levels) for x in range(cost_span + 1)], np.uint16)
+        levels = np.array([math.floor(eta * cost_span) for eta in etas(eta_max, eta_step)])
+        weights = np.array([np.count_nonzero(x <= levels) for x in range(cost_span + 1)], np.uint16)
     return {
         "minimum": scene.minimum,
         "count": scene.count,

@@ -5,6 +5,7 @@ namespace of maps of one shape: ``disparity``, ``lower``, ``upper``, ``confidenc
 a namespace of ``minimum``, ``maximum``, ``threshold``, ``kernel``, ``depth`` and ``tolerance``.
 """
 
+from itertools import groupby
 from statistics import mean, median
 
 import numpy as np
@@ -97,10 +98,11 @@ def deciles(confidence, judged, inside, width):
     """Pixels in the order of confidence to 0.001, equal ones together, in tenths of their middle ranks."""
     level = {p: round(1000 * float(confidence[p])) for p in judged if not np.isnan(confidence[p])}
     groups = {}
-    for value in sorted(set(level.values())):
-        below = sum(other < value for other in level.values())
-        same = [p for p in level if level[p] == value]
+    below = 0
+    for value, members in groupby(sorted(level, key=level.get), level.get):
+        same = list(members)
         groups.setdefault(int(10 * (below + len(same) / 2) // len(level)), []).append((value, same))
+        below += len(same)
     result = []
     for group in groups.values():
         members = [p for _, same in group for p in same]

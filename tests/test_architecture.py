@@ -4,6 +4,7 @@ import ast
 import importlib.util
 import tomllib
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -80,10 +81,16 @@ def modules() -> dict[str, Path]:
     }
 
 
+@cache
+def nodes() -> dict[str, list[ast.AST]]:
+    """All nodes of every module, itself first."""
+    return {module: list(ast.walk(ast.parse(file.read_text()))) for module, file in modules().items()}
+
+
 def imports() -> Iterator[tuple[str, str]]:
     """Every module with every full name that it imports, anywhere in it."""
-    for module, file in modules().items():
-        for node in ast.walk(ast.parse(file.read_text())):
+    for module, inside in nodes().items():
+        for node in inside:
             if isinstance(node, ast.Import):
                 yield from ((module, alias.name) for alias in node.names)
             elif isinstance(node, ast.ImportFrom):
@@ -134,11 +141,10 @@ def test_homes__records_are_written_in_one_place() -> None:
 def test_limits__functions_parameters_and_modules_stay_small() -> None:
     over = {}
     for module, file in modules().items():
-        tree = ast.parse(text := file.read_text())
-        documented = {line for node in ast.walk(tree) for line in docstring_lines(node)}
-        if (lines := len(text.splitlines()) - len(documented)) > MOST_MODULE_LINES:
+        documented = {line for node in nodes()[module] for line in docstring_lines(node)}
+        if (lines := len(file.read_text().splitlines()) - len(documented)) > MOST_MODULE_LINES:
             over[module] = f"{lines} lines"
-        for node in ast.walk(tree):
+        for node in nodes()[module]:
             if isinstance(node, ast.FunctionDef):
                 lines = len(set(range(node.lineno, node.end_lineno + 1)) - documented)
                 given = node.args

@@ -405,9 +405,8 @@ def test_ambiguity_weights__count_the_etas_that_reach_a_cost(
     assert weights is not None
     assert weights.dtype == np.uint16
     etas = [i * eta_step for i in range(101) if i * eta_step < eta_max]
-    assert weights.tolist() == [
-        sum(above <= eta * config.cost_span for eta in etas) for above in range(config.cost_span + 1)
-    ]
+    span = config.cost_span
+    assert weights.tolist() == [sum(above <= eta * span for eta in etas) for above in range(span + 1)]
 
 
 def test_thresholds__are_none_where_their_step_is_off() -> None:

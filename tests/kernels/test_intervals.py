@@ -21,7 +21,7 @@ from sat_intervals.prepare.in_memory import match_arrays
 from sat_intervals.products import BOUND_STEPS, IMPOSSIBLE_COST, INVALID, NO_BOUND, NO_DATA, NO_DISPARITY, REJECTED
 from sat_intervals.tiling import View, Window
 
-bounded = settings(max_examples=40, derandomize=True, deadline=None)
+bounded = settings(max_examples=25, derandomize=True, deadline=None)
 few = settings(max_examples=20, derandomize=True, deadline=None)
 some = settings(max_examples=25, derandomize=True, deadline=None)
 COUNTS = (1, 31, 32, 33, 64, 70)
@@ -307,7 +307,7 @@ def test_postprocess_rows__of_a_patch_equals_reference(seed, config, holes):
     check(final[:4], final.validity, expected, config)
 
 
-@settings(max_examples=50, derandomize=True, deadline=None)
+@settings(max_examples=30, derandomize=True, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1), config=configs(), holes=st.integers(0, 3), flat=st.sampled_from(["", "r", "lr", ""])
 )
