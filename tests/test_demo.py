@@ -5,7 +5,7 @@ import pytest
 
 from sat_intervals.demo import DATUM, GAIN, OFFSET, VIEWS, Scene, look, make_scene, make_views, profiles
 
-ROWS, COLUMNS = 300, 420  # with a river, houses, blocks, wood and fields
+ROWS, COLUMNS = 300, 320  # with a river, houses, blocks, wood and fields
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def test_look__shows_the_highest_of_all_crossings():
 
 def test_look__the_other_view_shows_the_same_point_or_a_higher_one():
     x, hidden = np.arange(COLUMNS), 0
-    for profile in list(profiles(ROWS, COLUMNS))[::10]:
+    for profile in list(profiles(ROWS // 2, COLUMNS))[::5]:
         for view in (0, 1):
             height, radiance, seen = look(profile, view, x)
             partner = x + (VIEWS[1 - view] - VIEWS[view]) * (height - DATUM)
@@ -98,13 +98,12 @@ def test_make_scene__visible_pixels_have_a_partner_with_data(scene):
     assert (scene.right[row, np.ceil(partner).astype(int)] > 0).all()
 
 
-@pytest.mark.parametrize("block", [7, 1000])
-def test_make_scene__does_not_depend_on_the_block(block):
-    assert equal(make_scene(50, 90, block=block), make_scene(50, 90))
+def test_make_scene__does_not_depend_on_the_block():
+    assert equal(make_scene(50, 90, block=7), make_scene(50, 90))
 
 
 def test_make_scene__seed_decides():
-    first, again, second = (make_scene(80, 120, seed) for seed in (1, 1, 2))
+    first, again, second = (make_scene(50, 90, seed) for seed in (1, 1, 2))
     assert equal(first, again)
     assert not np.array_equal(first.left, second.left)
     assert not np.array_equal(first.truth, second.truth, equal_nan=True)

@@ -17,7 +17,7 @@ def scenes():
     """Softmax volumes of our aggregated costs with their truths: the temperature makes them overconfident."""
     found = []
     for seed in range(8):
-        scene = make_scene(150, 200, seed=seed)
+        scene = make_scene(90, 150, seed=seed)
         images = (np.ma.masked_equal(image.astype(np.float32), 0) for image in (scene.left, scene.right))
         found.append((softmax(volume_of(*images, CONFIG, sgm=True), 2), scene.truth))
     return found
@@ -59,7 +59,7 @@ def test_calibrate_volumes__judges_a_single_volume_in_blocks(scenes) -> None:
 
 def test_calibrate_volumes__takes_a_mask_of_the_truth(scenes) -> None:
     volume, truth = (band[:60] for band in scenes[0])
-    unknown = np.indices(truth.shape)[1] < 90
+    unknown = np.indices(truth.shape)[1] < 60
     masked = np.ma.array(np.where(unknown, -9999.0, truth), mask=unknown)
     how = {"disparities": DISPARITIES, "kind": "probability", "config": {"interval": {"coverage": 0.9}}}
     expected = calibrate_volumes([(volume, np.where(unknown, np.nan, truth))], **how)
@@ -69,7 +69,7 @@ def test_calibrate_volumes__takes_a_mask_of_the_truth(scenes) -> None:
 def test_calibrate_volumes__refuses_in_one_line(scenes) -> None:
     volume, truth = scenes[0]
     refused = {
-        r"truth 0 is \(9, 200\), its volume \(150, 200\)": {"pairs": [(volume, truth[:9])]},
+        r"truth 0 is \(9, 150\), its volume \(90, 150\)": {"pairs": [(volume, truth[:9])]},
         "0 kept pixels have a truth, at least 1000": {"pairs": [(volume, np.full_like(truth, np.nan))]},
         "0 % of the disparities of truth 0 are among": {"pairs": [(volume, truth + 200)]},
         "regularization is null": {"pairs": [(volume, truth)], "config": {"regularization": None}},

@@ -18,7 +18,7 @@ from sat_intervals.match.coarse import (
 
 @pytest.fixture(scope="module")
 def scene():
-    return make_scene(300, 700, seed=7)
+    return make_scene(200, 700, seed=7)
 
 
 def small(image, step):
@@ -88,7 +88,7 @@ def test_fitted__has_no_more_disparities_than_the_right_image_has_columns(scene)
 
 def test_find_range__of_a_pair_that_shares_little_keeps_the_end_with_the_matches():
     """15 % overlap: disparities near -530, and stray matches near 300, together beyond the columns of the image."""
-    wide = make_scene(300, 1187, seed=3)
+    wide = make_scene(160, 1187, seed=3)
     left, right = wide.left[:, :620], wide.right[:, 527:1147]
     truth = wide.truth[:, 527:620] - 527
     found = searched(left, right).fitted(620)

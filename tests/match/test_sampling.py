@@ -11,7 +11,7 @@ from sat_intervals.tiling import Window
 
 @pytest.fixture(scope="module")
 def scene():
-    return make_scene(420, 480, seed=3)
+    return make_scene(328, 330, seed=3)
 
 
 def looks_at(left, right, scene):

@@ -11,7 +11,7 @@ from sat_intervals.demo import make_scene
 
 
 def test_prepare__arrays_equal_files_in_every_bit_with_found_ranges_and_rows(tmp_path):
-    scene = make_scene(300, 420, seed=8)
+    scene = make_scene(160, 420, seed=8)
     scene = replace(scene, right=np.pad(scene.right[2:], [(0, 2), (0, 0)]))  # 0 is no data
     write_pair(tmp_path, scene)
     settings = {"disparity": {"local": True}}

@@ -1,6 +1,7 @@
 """What is odd about a pair: each cause is named once, the likeliest first."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,8 +15,14 @@ from sat_intervals.run.quality import doubts_of_images, verdict_of
 
 
 @pytest.fixture(scope="module")
-def scene():
+def large():
     return make_scene(260, 330, seed=17)
+
+
+@pytest.fixture(scope="module")
+def scene(large):
+    parts = {name: getattr(large, name)[:180, :240] for name in ("left", "right", "truth")}
+    return replace(large, **parts)
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +33,7 @@ def wide():
 def lows(scene, folder, side):
     """A side of the pair whose smallest value is that of its undeclared_border."""
     pixels = getattr(scene, side).astype(np.uint16) + 2000
-    pixels[:, :55] = 777
+    pixels[:, :40] = 777
     write_layer(folder / f"{side}.tif", pixels, None, PLACE)
     return folder / f"{side}.tif"
 
@@ -85,7 +92,7 @@ def test_warnings_of__the_same_image_twice(scene, tmp_path):
 
 def test_doubts_of_images__of_two_sizes(scene, tmp_path):
     left, right = lows(scene, tmp_path, "left"), tmp_path / "right.tif"
-    write_layer(right, scene.right[:200, :290].astype(np.uint16) + 2000, 2000, PLACE)
+    write_layer(right, scene.right[:140, :210].astype(np.uint16) + 2000, 2000, PLACE)
     (line,) = doubts_of_images(open_image(left), open_image(right))
     assert line.startswith(f"{left}: 17 % of the pixels are exactly 777, along its borders")
     given = [open_image(image, nodata=value) for image, value in ((left, 777), (right, None))]
@@ -103,14 +110,14 @@ def test_warnings_of__isolated_pixels_without_data(scene, tmp_path):
     assert "of the pixels are no data or masked, but spoil the windows of" in report["warnings"][0]
 
 
-def test_warnings_of__images_that_have_little_in_common(scene, wide, tmp_path):
+def test_warnings_of__images_that_have_little_in_common(large, wide, tmp_path):
     """As of dates before and after a change: cross-checking keeps most of it, with intervals as wide as the range."""
-    other = wide.left[: len(scene.right), : scene.right.shape[1]]
+    other = wide.left[: len(large.right), : large.right.shape[1]]
     for own, count in ((0.7, 0), (0.25, 1)):
         images = [tmp_path / f"{side}{count}.tif" for side in ("left", "right")]
-        for image, pixels in zip(images, (scene.left, own * scene.right + (1 - own) * other), strict=True):
+        for image, pixels in zip(images, (large.left, own * large.right + (1 - own) * other), strict=True):
             write_layer(image, pixels.astype(np.uint16), 0, PLACE)
-        settings = {"disparity": {"minimum": scene.minimum, "maximum": scene.maximum}, "rows": "none"}
+        settings = {"disparity": {"minimum": large.minimum, "maximum": large.maximum}, "rows": "none"}
         report = match_pair(*images, tmp_path / str(count), settings)
         assert report["counts"]["valid"] > 0.5 * report["counts"]["pixels"]
         assert ["the median interval is" in line for line in report["warnings"]] == [True] * count

@@ -42,7 +42,7 @@ def moved_state(image, offset):
 
 @pytest.fixture(scope="module")
 def scene():
-    return make_scene(430, 520, seed=3)
+    return make_scene(384, 448, seed=3)
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +88,7 @@ def test_match_pair__takes_a_plane_of_rows_out(folder, scene, tmp_path):
     unmoved = run(tmp_path, tmp_path / "unmoved", scene)
     assert (left["rows"], unmoved["rows"]) == (None, None)
     rows = open_results(folder / "auto").rows
-    row, column = np.mgrid[0:430:30, 0:520:30]
+    row, column = np.mgrid[0:384:30, 0:448:30]
     assert np.abs(rows.at(row, column) - plane(row, column)).max() < 0.15
     found = report["survey"]["rows"]
     assert found["before"][0] > 1

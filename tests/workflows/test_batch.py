@@ -337,7 +337,9 @@ def test_plan__counts_the_jobs_of_a_batch_system_and_reads_images_as_match_does(
     assert "1 of 512 px" in result.stdout
 
 
-def test_plan__takes_another_sample_where_the_centre_holds_no_data_and_refuses_what_match_does(images, tmp_path):
+def test_plan__takes_another_sample_where_the_centre_holds_no_data_and_refuses_what_match_does(
+    images, tmp_path, monkeypatch
+):
     for side in ("left", "right"):
         with rasterio.open(images / f"{side}1.tif") as file:
             image = np.tile(file.read(1), (9, 5))[:700, :700]
@@ -346,8 +348,8 @@ def test_plan__takes_another_sample_where_the_centre_holds_no_data_and_refuses_w
     config = {"disparity": {"minimum": -18, "maximum": 40}}
     assert plan(tmp_path / "left.tif", tmp_path / "right.tif", config, workers=1).seconds > 0
     huge = {"disparity": {"minimum": -6000, "maximum": 6000}, "tiles": {"size": 4096}}
-    wide = np.ones((4096, 13000), np.uint8)
-    write_layer(tmp_path / "wide.tif", wide, 0, PLACE)
+    write_layer(tmp_path / "wide.tif", np.ones((64, 13000), np.uint8), 0, PLACE)
+    monkeypatch.setattr("sat_intervals.match.memory.usable_memory", lambda: 2 * 10**9)
     with pytest.raises(SatIntervalsError, match="GB, this process may use"):
         plan(tmp_path / "wide.tif", tmp_path / "wide.tif", huge)
 

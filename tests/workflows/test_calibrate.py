@@ -31,7 +31,7 @@ from sat_intervals.workflows.calibrate import Choices, scenes_of
 def scene(tmp_path_factory):
     """A folder of a pair, with its calibration in calibration.yaml and what the command printed in said."""
     folder = tmp_path_factory.mktemp("scene")
-    write_pair(folder, make_scene(150, 200, seed=5))
+    write_pair(folder, make_scene(100, 140, seed=5))
     result = invoke("calibrate", folder, "--output", folder / "calibration.yaml")
     assert result.exit_code == 0, result.output
     (folder / "said").write_text(result.output)
@@ -149,9 +149,9 @@ def one_line(result):
     ("truth", "words"),
     [
         (np.zeros((30, 40)), "30 x 40 pixels"),
-        (np.full((150, 200), np.nan), "0 known truths, at least 1000"),
-        (np.where(np.arange(150 * 200) == 20_000, -5, np.nan).reshape(150, 200), "1 known truths, at least 1000"),
-        (np.full((150, 200), 500), "30000 of 30000 truths are outside the search range"),
+        (np.full((100, 140), np.nan), "0 known truths, at least 1000"),
+        (np.where(np.arange(100 * 140) == 9000, -5, np.nan).reshape(100, 140), "1 known truths, at least 1000"),
+        (np.full((100, 140), 500), "14000 of 14000 truths are outside the search range"),
     ],
 )
 def test_calibrate__a_wrong_truth_is_one_line(scene, tmp_path, truth, words):
