@@ -58,8 +58,8 @@ class Tally:
     def report(self) -> dict[str, Any]:
         """Counts of pixels, and the median width in pixels, None where there is no interval.
 
-        ``ambiguous``: valid, with the whole search range as interval. ``flags`` counts a pixel under each of its flags,
-        ``causes`` each invalid pixel once, see `products.cause`: with ``valid`` they sum to ``pixels``.
+        ``ambiguous``: valid, as wide as the search range. ``flags`` counts a pixel under each of its flags, ``causes``
+        each invalid pixel once, see `products.cause`: with ``valid`` they sum to ``pixels``.
         """
         upto = np.cumsum(self._widths)
         median = round(float(np.searchsorted(upto, upto[-1] / 2) * _WIDTH_STEP), 2) if upto[-1] else None
@@ -68,7 +68,7 @@ class Tally:
         return {
             "pixels": int(self._sums.sum()),
             "valid": self._count(valid),
-            "ambiguous": int(self._widths[self._whole]),
+            "ambiguous": int(self._widths[self._whole :].sum()),
             "low_confidence": self._count(valid & (sums & REGULARIZED != 0)),
             "flags": {flag.name: self._count(sums & flag.value != 0) for flag in FLAGS},
             "causes": {flag.name: self._count(causes == flag.value) for flag in FLAGS if flag.invalid},

@@ -48,15 +48,21 @@ def tags_of(job: Job) -> dict[str, str]:
 def _tags_of_surface(job: Job, swept: Swept) -> dict[str, str]:
     """Return the tags of the surface of a sweep, see `surface_tags`; the size of tiles is not in them."""
     software = {"SOFTWARE": f"sat-intervals {version('sat-intervals')}"}
-    tags = {"RUNS": swept.asked, "HEIGHTS": f"above {swept.level}", "IMAGES": f"{len(job.images)}"}
-    tags |= tags_of_sweep(job.config)
+    tags = {"RUNS": swept.asked, "HEIGHTS": f"above {swept.level}"} | tags_of_sweep(job.config, len(job.images))
     cell = job.left.georeferencing.affine.a
     return software | (swept.calibration.tagged(tags, cell) if swept.calibration else tags)
 
 
-def tags_of_sweep(config: Config) -> dict[str, str]:
+def _margins(swept: Swept) -> dict[str, Any] | None:
+    """Return what identifies the calibration of heights that moved the bounds, and its coverage."""
+    if (found := swept.calibration) is None:
+        return None
+    return {"name": found.name, "sha256": found.sha256, "coverage": found.coverage}
+
+
+def tags_of_sweep(config: Config, images: int) -> dict[str, str]:
     """Return the tags of the intervals of a sweep, see `surface_key`."""
-    interval, tags = config.interval, {"INTERVAL": "cost curve of many images"}
+    interval, tags = config.interval, {"IMAGES": f"{images}", "INTERVAL": "cost curve of many images"}
     if interval and interval.coverage is not None:
         calibration = calibration_of(config)
         name = f"{calibration.name} {calibration.sha256}"
@@ -105,7 +111,7 @@ def report_of(
         "origin": origin_of(job.inputs),
         "local_ranges": prepared.ranges and prepared.ranges.report() | {"share": prepared.ranges.share},
         "inputs": job.inputs,
-        **({"sweep": job.swept.report} if job.swept else {}),
+        **({"sweep": job.swept.report | {"margins": _margins(job.swept)}} if job.swept else {}),
         "tiles": {
             "region": asdict(grid.region),
             "rows": grid.rows,

@@ -171,8 +171,7 @@ def _widened(finals: Iterable[Bands], calibration: HeightCalibration, ground: Gr
     assert ground is not None
     margins = Margins(*calibration.table())
     for rows, first, last in with_halo(finals, AROUND):
-        heights = ground.step * np.where(rows.valid, rows.disparity, np.nan)
-        final, relief = cut_rows(rows, first, last), relief_of(heights)[first:last]
+        final, relief = cut_rows(rows, first, last), relief_of(ground.step * rows.disparity)[first:last]
         middle, low, high = (ground.step * band.astype(np.float64) for band in final[:3])
         lower, upper = (end / ground.step for end in margins.widened(middle, low, high, relief))
         yield final._replace(lower=lower.astype(np.float32), upper=upper.astype(np.float32))

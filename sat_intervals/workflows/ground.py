@@ -10,18 +10,8 @@ from sat_intervals.config import Config, Sweep
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.models import SensorImage
 from sat_intervals.heights.point_cloud import Cells
-from sat_intervals.heights.stack import (
-    Fits,
-    Stack,
-    Surface,
-    aligned,
-    correlations,
-    level_config,
-    ranges_for,
-    samples_of,
-    surface_of,
-    tilted,
-)
+from sat_intervals.heights.shifts import Fits, aligned, correlations, tilted
+from sat_intervals.heights.stack import Stack, Surface, level_config, ranges_for, samples_of, surface_of
 from sat_intervals.heights.views import common_cells, undulation_at, views_of, with_pairs
 from sat_intervals.match.ground import BLOCK, GroundViews
 from sat_intervals.match.local_ranges import LocalRanges
@@ -84,15 +74,16 @@ class _Search:
 
     def align(self, stack: Stack, *, is_coarse: bool) -> Stack:
         """Find shifts, in rounds while they are large, at last planes; return the stack with them."""
+        reductions = stack.ground.reductions
         for is_last in [False] * (_ROUNDS - 1) + [True]:
             samples = samples_of(stack, self.each, is_coarse=is_coarse)
-            found, self.alike = aligned(stack, samples), correlations(samples)
-            if is_last or np.abs(found).max() < _SMALL * min(stack.ground.reductions):
+            found, self.alike = aligned(samples, reductions), correlations(samples)
+            if is_last or np.abs(found).max() < _SMALL * min(reductions):
                 break
             stack = self._moved(stack, found)
         if is_coarse:
             return self._moved(stack, found)
-        found, self.slopes, self.left = tilted(stack, samples, found)
+        found, self.slopes, self.left = tilted(samples, found, reductions)
         stack = self._moved(stack, found)
         return replace(stack, ground=stack.ground.tilted(self.slopes))
 

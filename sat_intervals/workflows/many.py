@@ -36,6 +36,9 @@ from sat_intervals.store.tiles import home_of
 from sat_intervals.tiling import Window
 
 ORTHO = "ortho.tif"
+# Ends of an extent in whole cells; cells that it may have.
+_ENDS = math.floor, math.floor, math.ceil, math.ceil
+_MOST_CELLS = 10**11
 # Of the figures of a geometry, those for batches and plans.
 FIGURES = "crs", "cells", "heights", "step", "images", "left_out"
 
@@ -122,8 +125,7 @@ def asked_of(images: Sequence[Image], out: Path, config: Config, wanted: Wanted,
     grid, cell, crs, _ = checked_cells(wanted.resolution, wanted.crs, None, wanted.geoid)
     if wanted.extent:
         grid = _cells_of(wanted.extent, grid, cell)
-    if wanted.calibration:
-        wanted.calibration.check_surface(surface_key(tags_of_sweep(config) | {"RUNS": "this"}, cell))
+    _check_margins(wanted.calibration, config, len(images), cell)
     check_folder(out, overwrite=overwrite, names=outputs_of(config))
     named = {f"image_{number}": image for number, image in enumerate(images, start=1)}
     inputs = describe_inputs(named, config, {})
@@ -144,18 +146,29 @@ def asked_of(images: Sequence[Image], out: Path, config: Config, wanted: Wanted,
     return Asked(named, config, wanted._replace(crs=crs), cell, grid, inputs, digest(plain(decisive)))
 
 
+def _check_margins(calibration: HeightCalibration | None, config: Config, images: int, cell: float) -> None:
+    """Raise for margins of other surfaces, such as those of another number of images."""
+    if calibration:
+        calibration.check_surface(surface_key(tags_of_sweep(config, images) | {"RUNS": "this"}, cell))
+
+
 def _cells_of(extent: tuple[float, float, float, float], grid: "Cells | None", cell: float) -> "Cells":
     """Return the cells of an extent: left, bottom, right and top on the map."""
     from sat_intervals.heights.point_cloud import Cells
 
     left, bottom, right, top = extent
-    if grid or not (left < right and bottom < top):
+    if grid or not (-math.inf < left < right < math.inf and -math.inf < bottom < top < math.inf):
         raise SatIntervalsError(
             f"extent is {left:g} {bottom:g} {right:g} {top:g}: give left, bottom, right and top on the map, in metres, "
             "and no raster whose grid is taken"
         )
-    first, last = (math.floor(left / cell), math.floor(bottom / cell)), (math.ceil(right / cell), math.ceil(top / cell))
-    return Cells(cell * first[0], cell * last[1], cell, last[1] - first[1], last[0] - first[0])
+    sides = (round(side / cell, 6) for side in extent)  # multiples of cells stay what they are
+    first, lowest, last, highest = (end(side) for end, side in zip(_ENDS, sides, strict=True))
+    if (last - first) * (highest - lowest) > _MOST_CELLS:
+        raise SatIntervalsError(
+            f"extent has {highest - lowest} x {last - first} cells of {cell:g} m: give a smaller one, or larger cells"
+        )
+    return Cells(cell * first, cell * highest, cell, highest - lowest, last - first)
 
 
 def _check_images(images: Sequence[Image], wanted: Wanted) -> None:
@@ -244,6 +257,7 @@ def with_range(config: Config, figures: Mapping[str, Any]) -> Config:
 def geometry_job(asked: Asked, out: Path, geometry: Geometry, region: Window | None = None, pair: str = "") -> Job:
     """Make the job of a sweep whose geometry is known: its left image is the grid of cells."""
     ground, figures = geometry
+    _check_margins(asked.wanted.calibration, asked.config, len(figures["used"]), figures["cells"]["resolution"])
     swept = Swept(
         {name: asked.images[name] for name in figures["used"]},
         asked.digest,
