@@ -26,6 +26,7 @@ if typing.TYPE_CHECKING:
     from sat_intervals.run.pair import match_pair
     from sat_intervals.tiling import Window
     from sat_intervals.workflows.calibrate import calibrate
+    from sat_intervals.workflows.change import change
     from sat_intervals.workflows.rectify import rectify
     from sat_intervals.workflows.surface import surface
 
@@ -33,9 +34,9 @@ if typing.TYPE_CHECKING:
 
 __all__ = [
     "Config", "RunError", "SatIntervalsError", "SurfaceChoices", "Window", "__version__", "calibrate",
-    "calibrate_surface", "calibrate_volumes", "decode_flags", "evaluate_run", "evaluate_surface", "intervals_around",
-    "intervals_of", "load_config", "load_height_calibration", "make_surface", "match_arrays", "match_pair", "open",
-    "open_image", "open_surface", "rectify", "set_geometry", "surface", "triangulate",
+    "calibrate_surface", "calibrate_volumes", "change", "decode_flags", "evaluate_run", "evaluate_surface",
+    "intervals_around", "intervals_of", "load_config", "load_height_calibration", "make_surface", "match_arrays",
+    "match_pair", "open", "open_image", "open_surface", "rectify", "set_geometry", "surface", "triangulate",
 ]  # fmt: skip
 
 logging.getLogger(__name__).addHandler(logging.NullHandler())  # the application configures logging
@@ -49,6 +50,7 @@ _HOMES = {
     "calibrate": "workflows.calibrate",
     "calibrate_surface": "evaluate.surface_calibration",
     "calibrate_volumes": "match.calibrate_volumes",
+    "change": "workflows.change",
     "decode_flags": "interop.dataset",
     "evaluate_run": "evaluate.disparity",
     "evaluate_surface": "evaluate.surface_accuracy",

@@ -189,6 +189,15 @@ SURFACE = (
     Band("agreement", "", "1 where the intervals of several pairs meet, 0 where they do not; no data for one pair"),
 )
 
+# Bands of the change of height between two surfaces.
+CHANGE = (
+    Band("difference", "m", "height after - height before"),
+    Band("difference_lower", "m", "lower bound of the difference"),
+    Band("difference_upper", "m", "upper bound of the difference"),
+    Band("significance", "", "probability of a difference as large, or larger, without a change"),
+    Band("change", "", "1 risen, -1 fallen, 0 neither, or in an area that is too small"),
+)
+
 # The same of many images that were compared at heights.
 _OF_SWEEP = {
     "height": "height at which the images are most alike",

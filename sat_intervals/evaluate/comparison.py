@@ -142,7 +142,8 @@ def shared_errors(given: Comparison) -> list[str]:
         return []
     return [
         f"{given.reference} is a surface of this tool, too: errors that both share do not show, so coverage is too "
-        "large and margins are too small; compare with heights of another source"
+        "large and margins are too small; compare with heights of another source; what changed between two dates, "
+        "sat-intervals change finds"
     ]
 
 
@@ -213,7 +214,7 @@ def _blocks_of_raster(given: Comparison) -> Blocks | None:
     """Return cells of the surface on blocks of the reference."""
     parts = []
     for core in spread_blocks(given.area, _SMALLEST):
-        height = read_layers(given.surface, core)[0].astype(np.float64)
+        height = read_heights(given.surface, given.place, given.shape, core)
         row, column = np.nonzero(np.isfinite(height))
         if row.size:
             chosen = every_nth(row.size)

@@ -39,7 +39,7 @@ class PointFile:
         is_cloud = ending in (".las", ".laz")
         crs_of = _crs_of_las if is_cloud else _crs_of_table
         self._parts = _las if is_cloud else _of_table
-        with _reading(path):
+        with reading(path):
             own = crs_of(path)
         self.frame = Frame(str(path), crs or own or surface[0], vertical, surface[1])
 
@@ -48,7 +48,7 @@ class PointFile:
 
         A fourth column, if asked for, has the column ``sigma`` of a table, NaN without.
         """
-        with _reading(self._path):
+        with reading(self._path):
             for part in self._parts(self._path, with_sigma):
                 # other heights are no-data values
                 places = part[:, :3]
@@ -57,7 +57,7 @@ class PointFile:
 
 
 @contextmanager
-def _reading(path: Path) -> Iterator[None]:
+def reading(path: Path, what: str = "points") -> Iterator[None]:
     """Turn the errors of the libraries, which are of many types, into one with the name of the file."""
     try:
         yield
@@ -67,7 +67,7 @@ def _reading(path: Path) -> Iterator[None]:
         raise SatIntervalsError(f"{path} needs {error.name}: pip install 'sat-intervals[reference]'") from error
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise SatIntervalsError(f"{path} cannot be read as points: {reason}: correct or convert it") from error
+        raise SatIntervalsError(f"{path} cannot be read as {what}: {reason}: correct or convert it") from error
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from rasterio.io import DatasetWriter
 
 from sat_intervals.products import (
     BANDS,
+    CHANGE,
     FLAGS,
     FLAGS_OF_SWEEP,
     INVALID,
@@ -74,8 +75,9 @@ def run_files(compression: str, extra: Collection[str] = (), *, of_heights: bool
     return intervals, replace(VALIDITY, compression=compression)
 
 
-# Files by name: points, surface models, true disparities, local search ranges.
+# Files by name: points, surface models, changes of height, true disparities, local search ranges.
 points_file = partial(File, dtype="float64", nodata=nan, bands=POINTS, predictor="FLOATING_POINT")
 surface_file = partial(File, dtype="float32", nodata=nan, bands=SURFACE)
+change_file = partial(File, dtype="float32", nodata=nan, bands=CHANGE)
 truth_file = partial(File, dtype="float32", nodata=nan, bands=TRUTH)
 ranges_file = partial(File, dtype="int16", nodata=None, bands=RANGES)

@@ -101,6 +101,7 @@ def test_evaluate_surface__a_reference_of_this_tool_is_no_truth(tmp_path):
     )
     (line,) = evaluate_surface(model, other, registers=False)["warnings"]
     assert f"{other} is a surface of this tool, too: errors that both share do not show" in line
+    assert "sat-intervals change" in line
 
 
 def test_evaluate_surface__warns_of_a_surface_that_is_upside_down(tmp_path):

@@ -1,0 +1,115 @@
+"""Compare surfaces of two dates cell by cell: differences, their deviations, and what they are without a change."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.evaluate.comparison import Comparison, check_common, registered
+from sat_intervals.kernels.significance import MEDIAN, SCALE, Correlation, correlation_of, probability, ratio_of
+from sat_intervals.raster.epochs import Epoch, open_epoch
+from sat_intervals.raster.surfaces import check_reference, covered_window, resolution_of
+from sat_intervals.tiling import Grid, Window, strips
+
+_STRIP = 1 << 20  # cells compared at a time, some hundred bytes each
+_BLOCK, _BLOCKS = 256, 64  # cells along a block that statistics are of, and their number
+_CHANGED = 0.01  # probability up to which they leave differences out
+_STILL = {"shift": (0.0, 0.0, 0.0), "deviation": (0.0, 0.0, 0.0)}
+
+
+class Difference(NamedTuple):
+    """Height after - before of cells, and standard deviations of its lower and upper side: metres."""
+
+    height: np.ndarray
+    down: np.ndarray
+    up: np.ndarray
+
+    @property
+    def ratio(self) -> np.ndarray:
+        """Return the difference in standard deviations of the side of 0."""
+        return np.asarray(self.height / np.where(self.height > 0, self.down, self.up))
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Surfaces of two dates on the grid of the first; ``registration`` moves the second, see `Registration.report`.
+
+    ``median`` of absolute ratios; ``correlation`` of those without a change, see `kernels.significance`.
+    """
+
+    before: Epoch
+    after: Epoch
+    registration: dict[str, Any] | None
+    median: float = 0.0
+    correlation: Correlation = Correlation(1.0, [0.0], [1.0])  # noqa: RUF009 (nothing changes it)
+
+    @property
+    def scale(self) -> float:
+        """Return the scale of Student's distribution."""
+        return float(max(SCALE, self.median / MEDIAN))
+
+    @property
+    def shift(self) -> np.ndarray:
+        """Return metres that the second surface is moved by, and their standard deviation: ``(2, 3)``."""
+        known = self.registration or _STILL
+        return np.array([known["shift"], [deviation or 0.0 for deviation in known["deviation"]]])
+
+    def strips(self) -> Iterator[Window]:
+        """Yield windows of whole rows from the top."""
+        return strips(*self.before.shape, _STRIP)
+
+    def read(self, window: Window) -> Difference:
+        """Read a window of both."""
+        (east, north, up), deviation = self.shift
+        around = window.grown(1, 1).clipped(Window(0, 0, *self.before.shape))
+        inner = window.relative_to(around).slices
+        ground = self.before.read(around)
+        height, lower, upper = ground[:, *inner]
+        then, then_lower, then_upper = up + self.after.drawn(
+            self.before.place.shifted(window).moved(-east, -north), height.shape
+        )
+        one, other = self.before.deviations, self.after.deviations
+        across, down = self.before.place.pixel_size
+        slopes = np.nan_to_num(np.gradient(ground[0], down, across))[:, *inner]
+        shift = deviation[2] ** 2 + (deviation[1] * slopes[0]) ** 2 + (deviation[0] * slopes[1]) ** 2
+        return Difference(
+            then - height,
+            np.sqrt(((upper - height) / one) ** 2 + ((then - then_lower) / other) ** 2 + shift),
+            np.sqrt(((height - lower) / one) ** 2 + ((then_upper - then) / other) ** 2 + shift),
+        )
+
+    def bands(self, found: Difference) -> np.ndarray:
+        """Return difference, bounds of the coverage of the first surface, significance: ``(4, rows, columns)``."""
+        half = ratio_of(1 - self.before.coverage, self.scale)
+        bounds = found.height - half * found.down, found.height + half * found.up
+        return np.stack([found.height, *bounds, probability(found.ratio, self.scale)])
+
+
+def open_pair(before: str | Path, after: str | Path, sigma: float | None, *, registers: bool) -> tuple[Pair, list[str]]:
+    """Open surfaces of two dates, register the second, measure what differs without a change; return warnings, too."""
+    one, other = open_epoch(before, sigma), open_epoch(after, sigma)
+    if one.level and other.level and one.level != other.level:
+        raise SatIntervalsError(
+            f"{one.path} has heights {one.level}, {other.path} {other.level}: make both with the same --geoid"
+        )
+    check_reference(other.path, one.path)
+    check_reference(one.path, other.path)
+    resolution, area = resolution_of(other.path, one.place), covered_window(other.path, one.place, one.shape)
+    given = Comparison(one.path, other.path, one.shape, one.place, resolution, 1, area)
+    moved, warnings = registered(given) if registers else (given, [])
+    pair = Pair(one, other, moved.registration)
+    blocks = list(Grid(area, _BLOCK))
+    found = [pair.read(block.core) for block in blocks[:: -(-len(blocks) // _BLOCKS)]]
+    heights, ratios = (
+        np.concatenate([part[np.isfinite(part)] for part in parts])
+        for parts in ([part.height for part in found], [part.ratio for part in found])
+    )
+    up = pair.shift[0, 2]
+    warnings += check_common(given, ratios.size, float(np.median(heights)) - up if ratios.size else None)
+    pair = replace(pair, median=float(np.median(np.abs(ratios))))
+    limit = ratio_of(_CHANGED, pair.scale)
+    parts = [np.where(np.abs(part.ratio) < limit, part.ratio, np.nan) for part in found]
+    return replace(pair, correlation=correlation_of(parts, one.place.pixel_size[0])), warnings

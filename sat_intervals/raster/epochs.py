@@ -1,0 +1,89 @@
+"""Read the heights of one of two dates with their bounds: a surface model of this tool, or of others with sigma."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import NormalDist
+
+import numpy as np
+from pyproj import Transformer
+
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.kernels.change import drawn
+from sat_intervals.products import SURFACE
+from sat_intervals.raster.georeferencing import Georeferencing, horizontal_name
+from sat_intervals.raster.heightfield import warn_of_no_data
+from sat_intervals.raster.images import opened
+from sat_intervals.raster.layers import read_layers
+from sat_intervals.raster.projection import transformed
+from sat_intervals.raster.surfaces import read_heights, read_place, resolution_of
+from sat_intervals.tiling import Window
+
+_COVERAGE = 0.9  # of bounds that are made of standard deviations
+_DEVIATIONS = "sigma", "std", "error", "uncertainty"  # words in names of bands
+
+
+@dataclass(frozen=True)
+class Epoch:
+    """Heights of a date; ``sigma`` is their standard deviation, None with bounds; ``band`` that of sigma, from 1."""
+
+    path: Path
+    shape: tuple[int, int]
+    place: Georeferencing
+    level: str  # what heights are above, "" if unknown
+    coverage: float
+    sigma: float | None = None
+    band: int | None = None
+
+    @property
+    def deviations(self) -> float:
+        """Return the standard deviations in a half width."""
+        return NormalDist().inv_cdf((1 + self.coverage) / 2)
+
+    def read(self, window: Window) -> np.ndarray:
+        """Read height and both bounds of a window inside: ``(3, rows, columns)`` float64, NaN where unknown."""
+        if self.sigma is None and self.band is None:
+            return read_layers(self.path, window)[:3].astype(np.float64)
+        height = read_heights(self.path, self.place, self.shape, window)
+        sigma = self.sigma if self.band is None else read_layers(self.path, window, self.band)
+        half = self.deviations * np.asarray(sigma, np.float64)
+        return np.stack([height, height - half, height + half])
+
+    def drawn(self, place: Georeferencing, shape: tuple[int, int]) -> np.ndarray:
+        """Read the same at the centres of other cells, see `kernels.change.drawn`; NaN outside."""
+        grid, own = place.affine, self.place.affine
+        x, y = np.meshgrid(grid.c + (np.arange(shape[1]) + 0.5) * grid.a, grid.f + (np.arange(shape[0]) + 0.5) * grid.e)
+        if place.crs != self.place.crs:
+            crs, target = (horizontal_name(one.crs) for one in (place, self.place) if one.crs)
+            x, y = transformed(Transformer.from_crs(crs, target, always_xy=True), x, y)
+        column, row = (x - own.c) / own.a - 0.5, (y - own.f) / own.e - 0.5
+        reach = max(1.0, grid.a / resolution_of(self.path, place))
+        first, last = (row.min() - reach, column.min() - reach), (row.max() + reach + 1, column.max() + reach + 1)
+        window = Window.around(first, last).clipped(Window(0, 0, *self.shape))
+        if not (window.height and window.width):
+            return np.full((3, *shape), np.nan)
+        bands = self.read(window)
+        found = drawn(bands, column.ravel() - window.column, row.ravel() - window.row, reach)
+        return np.asarray(found.reshape(3, *shape))
+
+
+def open_epoch(path: str | Path, sigma: float | None = None) -> Epoch:
+    """Open a surface model, or the folder that has it as dsm.tif; ``sigma`` in metres is for those without bounds."""
+    path = Path(path) / "dsm.tif" if Path(path).is_dir() else Path(path)
+    shape, place = read_place(path)
+    assert place.crs is not None
+    if not place.crs.is_projected:
+        raise SatIntervalsError(f"{path} has cells in degrees: resample it to a map in metres, such as with gdalwarp")
+    with opened(str(path)) as dataset:
+        names, tags = dataset.descriptions, dataset.tags()
+    level = tags.get("HEIGHTS", "")
+    if names == tuple(band.name for band in SURFACE):
+        if "COVERAGE" not in tags:
+            raise SatIntervalsError(f"{path} has no bounds with a coverage: make it of runs with --coverage")
+        return Epoch(path, shape, place, level, float(tags["COVERAGE"]))
+    bands = [n for n, name in enumerate(names, 1) if any(word in (name or "").lower() for word in _DEVIATIONS)]
+    if sigma is None and not bands:
+        raise SatIntervalsError(
+            f"{path} has neither bounds nor a band named sigma: give --sigma, the standard deviation of its heights"
+        )
+    warn_of_no_data(path)
+    return Epoch(path, shape, place, level, _COVERAGE, sigma, None if sigma is not None else bands[0])
