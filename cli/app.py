@@ -13,6 +13,7 @@ import click
 
 from sat_intervals.cli.batch import batch
 from sat_intervals.cli.calibrate import calibrate
+from sat_intervals.cli.change import change
 from sat_intervals.cli.config import config
 from sat_intervals.cli.demo import demo
 from sat_intervals.cli.dsm import dsm
@@ -42,7 +43,7 @@ STEPS: dict[str, tuple[click.Command, ...]] = {
     "Try and prepare": (demo, search_range, plan, config),
     "Match": (match, batch, status),
     "Inspect": (plot, report, project),
-    "Heights": (surface, rectify, dsm, triangulate),
+    "Heights": (surface, change, rectify, dsm, triangulate),
     "Compare with a truth": (reference, evaluate, calibrate),
     "Use elsewhere": (export, stac),
 }

@@ -32,6 +32,7 @@ STAGES = {
     "geometry": "reading models and grids",
     "resampling": "resampling rows",
     "cells": "filling rows of cells",
+    "change": "comparing rows of cells",
     "registration": "registering the reference",
     "reference": "reading points",
     "truth": "finding disparities of rows",

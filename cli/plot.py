@@ -48,21 +48,24 @@ def plot(
     OUT/profile.png    with --row: interval, disparity and truth along a row
     OUT/curve.png      with --pixel: cost curve of a pixel and its interval
     OUT/dsm.png        with dsm.tif: hillshade, height, half width, confidence
+    OUT/change.png     of a folder of `change`: significant changes of height
 
     Of three images and more, only dsm.png is drawn. Rows and columns count from 0 at the first pixel of
     OUT/intervals.tif. Needs matplotlib: pip install 'sat-intervals[plot]'.
     """  # noqa: D301 (\b keeps the line breaks in click)
-    from sat_intervals.results import open_results
+    from sat_intervals.results import open_results, read_change
     from sat_intervals.show.accuracy import draw_coverage
     from sat_intervals.show.maps import draw_errors, draw_overview
     from sat_intervals.show.preparation import draw_range, draw_rows, has_range, has_rows
     from sat_intervals.show.profile import draw_curve, draw_profile
     from sat_intervals.show.surface_map import draw_surface
 
+    of_pair = {"row": row, "columns": columns, "pixel": pixel, "beside": beside or None}
+    if changed := read_change(out):
+        return _plot_change(out, changed, dpi, of_pair | {"truth": truth})
     results = open_results(out, truth)
     if results.is_sweep:
-        _plot_sweep(results, dpi, {"row": row, "columns": columns, "pixel": pixel, "beside": beside or None})
-        return
+        return _plot_sweep(results, dpi, of_pair)
     is_judged = results.truth is not None and results.config.interval is not None
     _check_options(results, row, columns, beside, is_judged=is_judged)
     results.check_kept([out / f"{name}.png" for name in PICTURES], [truth, judging["mask"], out / "dsm.tif"])
@@ -101,14 +104,28 @@ def _check_options(
         raise SatIntervalsError(f"--columns {columns[0]} {columns[1]} belong to a profile: give --row too")
 
 
-def _plot_sweep(results: "Results", dpi: int, of_pair: dict[str, Any]) -> None:
-    """Draw the heights of many images; raise if an option is given that only a pair has."""
+def _refuse(of_pair: dict[str, Any], what: str) -> None:
+    """Raise if an option is given that only a pair has."""
     from sat_intervals.errors import SatIntervalsError
-    from sat_intervals.show.surface_map import draw_surface
 
     if given := [name for name, value in of_pair.items() if value is not None]:
-        many = f"{results.out} is of {len(results.images)} images"
-        raise SatIntervalsError(f"--{given[0]} is for a pair, {many}: leave it out")
+        raise SatIntervalsError(f"--{given[0]} is for a pair, {what}: leave it out")
+
+
+def _plot_change(out: Path, report: dict[str, Any], dpi: int, of_pair: dict[str, Any]) -> None:
+    """Draw the change between two dates."""
+    from sat_intervals.show.change_map import draw_change
+
+    _refuse(of_pair, f"{out} is a change between two dates")
+    draw_change(out / "change.tif", report, out / "change.png", dpi)
+    click.echo(out / "change.png")
+
+
+def _plot_sweep(results: "Results", dpi: int, of_pair: dict[str, Any]) -> None:
+    """Draw the heights of many images."""
+    from sat_intervals.show.surface_map import draw_surface
+
+    _refuse(of_pair, f"{results.out} is of {len(results.images)} images")
     results.check_kept([results.out / "dsm.png"])
     draw_surface(results.out / "dsm.tif", results.out / "dsm.png", dpi)
     click.echo(results.out / "dsm.png")

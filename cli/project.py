@@ -18,6 +18,8 @@ def project(out: Path) -> None:
                               heights with hillshade after dsm
     OUT/width.vrt             interval width, computed when it is read
     OUT/dsm_half_width.vrt    half the width of the intervals of heights
+    OUT/project.qgz           of a folder of `change`: change, difference,
+                              significance
     OUT/*.qml                 style of the raster of the same name
 
     QGIS 3.22 or newer opens it. Files of these names are replaced: save changes in QGIS under another name.

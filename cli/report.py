@@ -16,9 +16,14 @@ def report(out: Path, truth: Path | None) -> None:
 
     It shows maps, the interval profile of any row, histograms, validity, tiles and seams, settings and times. With a
     truth, it also shows how often the intervals contain it. For large images, maps and profiles show every n-th row and
-    column.
+    column. Of a folder of `change` it has its figures and, once `plot` has drawn it, the map.
     """
-    from sat_intervals.results import open_results
+    from sat_intervals.cli.tables import change_lines
+    from sat_intervals.results import open_results, read_change
+    from sat_intervals.show.report.change_page import write_change_page
     from sat_intervals.show.report.page import write_report
 
-    click.echo(write_report(open_results(out, truth)))
+    if changed := read_change(out):
+        click.echo(write_change_page(out, changed, change_lines(changed)))
+    else:
+        click.echo(write_report(open_results(out, truth)))

@@ -186,7 +186,28 @@ def _nominal_line(report: dict[str, Any]) -> str:
     )
 
 
-def registration_lines(found: dict[str, Any] | None) -> list[str]:
+def change_lines(report: dict[str, Any]) -> list[str]:
+    """Return lines about a change of height: shift, shares, volumes, and the rate of false alarms."""
+    cells, rate = report["cells"], report["rate"]
+    share = {name: f"{100 * count / max(1, cells['compared']):.2f} %" for name, count in cells.items()}
+    volumes = (f"{name} {value:.0f} +-{deviation:.0f}" for name, (value, deviation) in report["volume"].items())
+    checked = (
+        f"without --stable, checked on the bulk alone: half of the differences are below {rate['median']:.2f} standard "
+        "deviations"
+    )
+    if rate["stable"]:
+        checked = f"{100 * rate['measured']:.2g} % measured on {rate['stable']} stable cells"
+    return [
+        *registration_lines(report["registration"], "second surface")[:1],
+        f"{report['areas']} areas of {report['smallest_area']:g} m2 or more: {share['risen']} of the cells risen, "
+        f"{share['fallen']} fallen",
+        f"volumes with standard deviations (m3): {', '.join(volumes)}",
+        f"{100 * cells['undecided'] / (cells['undecided'] + cells['compared']):.1f} % of the cells without a decision",
+        f"false alarms: {100 * rate['named']:g} % named; {checked}",
+    ]
+
+
+def registration_lines(found: dict[str, Any] | None, moved: str = "reference") -> list[str]:
     """Return lines for the user about a registration: the shift, and figures before and after it."""
     if found is None:
         return []
@@ -194,14 +215,14 @@ def registration_lines(found: dict[str, Any] | None) -> list[str]:
         f"{value:+.2f} m" + ("" if deviation is None else f" (standard deviation {deviation:.2g})")
         for value, deviation in zip(found["shift"], found["deviation"], strict=True)
     )
-    lines = [f"reference moved: easting {east}, northing {north}, height {up}"]
+    lines = [f"{moved} moved: easting {east}, northing {north}, height {up}"]
     if not any(found["shift"]) and found["is_horizontal"]:
         deviations = ", ".join(f"{value:.2g} m" for value in found["deviation"])
-        lines = [f"reference not moved: its shift is less than two standard deviations, {deviations}"]
+        lines = [f"{moved} not moved: its shift is less than two standard deviations, {deviations}"]
     if not found["is_horizontal"]:
         lines = [
-            f"reference moved: height {up}; easting and northing cannot be determined: flat ground, or a "
-            f"reference many cells off"
+            f"{moved} moved: height {up}; easting and northing cannot be determined: flat ground, or a "
+            f"{moved} many cells off"
         ]
     for when in ("before", "after"):
         figures = found[when]

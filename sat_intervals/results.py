@@ -235,6 +235,17 @@ def open_run(out: str | Path) -> Run:
         return Run(file.parent, report, config, region, Georeferencing.of(dataset))
 
 
+def read_change(out: str | Path) -> dict[str, Any] | None:
+    """Return the content of ``change.json`` of a folder; None without the file, or if the folder has a run."""
+    file = Path(out) / "change.json"
+    try:
+        return None if file.with_name("run.json").exists() else dict(json.loads(file.read_bytes()))
+    except FileNotFoundError:
+        return None
+    except ValueError as error:
+        raise SatIntervalsError(f"{file} is damaged: run sat-intervals change with --overwrite") from error
+
+
 def open_results(out: str | Path, truth: str | Path | None = None) -> Results:
     """Open a finished run, its images and its truth, by default ``truth.tif`` beside the left image if it exists."""
     run = open_run(out)

@@ -12,7 +12,9 @@ from xarray.core import indexing
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import FLAGS, INVALID, WIDTH, flag_attributes
 from sat_intervals.raster import File, Georeferencing, read_layers, read_tags, run_files, surface_file, surface_place
+from sat_intervals.raster.files import change_file
 from sat_intervals.raster.projection import grid_mapping
+from sat_intervals.raster.surfaces import is_change, read_place
 from sat_intervals.results import open_run
 from sat_intervals.tiling import Window
 
@@ -85,12 +87,12 @@ def open(out: str | Path, chunks: int | None = 2048) -> xr.Dataset:
 
 
 def open_surface(path: str | Path, chunks: int | None = 2048) -> xr.Dataset:
-    """Open a surface model as a lazy dataset: ``sat_intervals.open_surface("out/dsm.tif")``.
+    """Open a surface model, or a change, as a lazy dataset: ``sat_intervals.open_surface("out/dsm.tif")``.
 
     Parameters
     ----------
     path
-        File that `surface` or `make_surface` has written.
+        File that `surface` or `make_surface` has written, or ``change.tif`` of `change`.
     chunks
         Rows and columns of a dask chunk, as for `open`.
 
@@ -100,21 +102,24 @@ def open_surface(path: str | Path, chunks: int | None = 2048) -> xr.Dataset:
         With the dimensions ``y`` and ``x``: ``height``, ``height_lower``, ``height_upper`` (metres), ``count``,
         ``confidence`` and ``agreement``, NaN where unknown. The coordinate ``spatial_ref`` has CRS and transform by the
         CF conventions. Attributes are ``vertical_datum``, what heights are above, the ``coverage`` or ``alpha`` of the
-        intervals.
+        intervals. A change has ``difference``, its bounds, ``significance`` and ``change``.
 
     Raises
     ------
     SatIntervalsError
-        The file cannot be read, or is no surface model of this package.
+        The file cannot be read, or is no such file of this package.
     """
     file = Path(path)
-    shape, place = surface_place(file)
+    changes = is_change(file)
+    shape, place = read_place(file) if changes else surface_place(file)
     dataset = xr.Dataset(coords=_coordinates(place, shape))
-    dataset.attrs = {"title": _SURFACE, "source": "sat-intervals"} | _attributes_of_surface(file)
+    dataset.attrs = {"title": "change of height" if changes else _SURFACE, "source": "sat-intervals"}
+    dataset.attrs |= _attributes_of_surface(file)
     datum = dataset.attrs["vertical_datum"]
-    _add_bands(dataset, surface_file(file.name), file, shape)
+    _add_bands(dataset, (change_file if changes else surface_file)(file.name), file, shape)
     level = "reference_ellipsoid" if datum.endswith("ellipsoid") else "geopotential_datum"
-    dataset["height"].attrs["standard_name"] = f"height_above_{level}"
+    if not changes:
+        dataset["height"].attrs["standard_name"] = f"height_above_{level}"
     return dataset if chunks is None else dataset.chunk({"y": chunks, "x": chunks})
 
 

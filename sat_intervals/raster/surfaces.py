@@ -13,7 +13,7 @@ from rasterio.warp import calculate_default_transform, reproject, transform_boun
 from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.products import SURFACE
+from sat_intervals.products import CHANGE, SURFACE
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.heightfield import is_ground, other_unit, warn_of_no_data
@@ -30,6 +30,12 @@ def surface_place(path: Path) -> tuple[tuple[int, int], Georeferencing]:
         if dataset.descriptions != tuple(band.name for band in SURFACE):
             raise SatIntervalsError(f"{path} is not a surface model of sat-intervals dsm: give one, or make it again")
     return read_place(path)
+
+
+def is_change(path: Path) -> bool:
+    """Return whether a file has the bands of a change of height."""
+    with opened(str(path)) as dataset:
+        return tuple(dataset.descriptions) == tuple(band.name for band in CHANGE)
 
 
 def read_place(path: Path) -> tuple[tuple[int, int], Georeferencing]:

@@ -13,17 +13,19 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.products import BANDS, SURFACE, SURFACE_OF_SWEEP
+from sat_intervals.products import BANDS, CHANGE, SURFACE, SURFACE_OF_SWEEP
 from sat_intervals.raster import Georeferencing, open_image, read_layers, read_place, read_small_layers
 from sat_intervals.raster.publishing import write_file
 from sat_intervals.raster.windows import read_small_image
-from sat_intervals.results import Run, open_input, open_run
+from sat_intervals.results import Run, open_input, open_run, read_change
 from sat_intervals.show import styles
+from sat_intervals.show.legend import widest
 from sat_intervals.tiling import Window
 
 _LONGEST = 1024  # pixels, longest side of what percentiles are taken from
 _MULTIPLY = 6  # QGIS' blend mode
 _CHECKED = "Qt::Checked"
+_PROJECT = "project.qgz"
 _STYLED = "intervals", "width", "validity", "dsm", "dsm_half_width"  # rasters with a default style
 
 _LOG = getLogger(__name__)
@@ -57,22 +59,29 @@ def write_project(out: str | Path) -> list[Path]:
     """Write ``project.qgz`` to the folder of a finished run, and the default styles of its rasters; return the files.
 
     The project has the images and the truth, disparity, interval width, confidence and validity; if ``dsm.tif`` is
-    of this run, also its heights. Of a sweep of many images it has heights and validity. Paths in it are relative where
+    of this run, also its heights. Of a sweep of many images it has heights and validity, of a folder of `change` the
+    change of height. Paths in it are relative where
     the files are local.
     """
+    if read_change(out):
+        return _write(Path(out), [*_change(Path(out))], [])
     run = open_run(out)
-    file = run.out / "project.qgz"
-    run.check_kept([file, *(run.out / f"{name}{end}" for name in _STYLED for end in (".qml", ".vrt"))])
-    layers = [*_surface(run), *_results(run)]
+    names = (f"{name}{end}" for name in _STYLED for end in (".qml", ".vrt"))
+    run.check_kept([run.out / name for name in (_PROJECT, *names)])
+    return _write(run.out, [*_surface(run), *_results(run)], [*_images(run)])
+
+
+def _write(out: Path, layers: list[ProjectLayer], images: list[ProjectLayer]) -> list[Path]:
+    """Write a project of layers, virtual rasters and styles; return the files."""
     written = {Path(layer.raster.source): layer.raster.virtual for layer in layers if layer.raster.virtual}
     for layer in layers:
         if layer.is_default:
             written[Path(layer.raster.source).with_suffix(".qml")] = styles.default_style(layer.renderer)
     content = BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
-        root = _project(run, [*layers, *_images(run)])
+        root = _project(out, [*layers, *images])
         archive.writestr(zipfile.ZipInfo("project.qgs"), styles.text_of(root, styles.HEAD))
-    written[file] = content.getvalue()
+    written[out / _PROJECT] = content.getvalue()
     for path, text in written.items():
         write_file(path, text)
     return list(written)
@@ -117,6 +126,21 @@ def _surface(run: Run) -> Iterator[ProjectLayer]:
     yield ProjectLayer(group, "hillshade", "shaded heights", surface, styles.hillshade(1), is_shown=True)
 
 
+def _change(out: Path) -> Iterator[ProjectLayer]:
+    """Yield the layers of a change of height."""
+    file = out / "change.tif"
+    shape, place = read_place(file)
+    raster, (difference, *_, change) = Raster(file, place, shape), read_small_layers(file, _fitting(shape))
+    end = widest(np.abs(difference[np.abs(change) == 1]), styles.CUT)
+    names = {band.name: band.meaning for band in CHANGE}
+    for number, name, renderer in (
+        (5, "change", styles.diverging(5, 1.0)),
+        (4, "significance", styles.shares(4)),
+        (1, "difference", styles.diverging(1, end, unit="m")),
+    ):
+        yield ProjectLayer("Change", name, names[name], raster, renderer, number == 1, number != 4)
+
+
 def _images(run: Run) -> Iterator[ProjectLayer]:
     """Yield truth and images; those that cannot be opened are left out, and raw ones, which are on no map."""
     if run.is_sweep:
@@ -144,10 +168,10 @@ def _fitting(shape: tuple[int, int]) -> tuple[int, int]:
     return -(-shape[0] // step), -(-shape[1] // step)
 
 
-def _project(run: Run, layers: list[ProjectLayer]) -> Element:
+def _project(out: Path, layers: list[ProjectLayer]) -> Element:
     """Return the project; the first layer is on top, and its CRS and extent are those of the map."""
-    root = Element("qgis", version=styles.VERSION, projectname=run.out.resolve().name)
-    SubElement(root, "title").text = run.out.resolve().name
+    root = Element("qgis", version=styles.VERSION, projectname=out.resolve().name)
+    SubElement(root, "title").text = out.resolve().name
     first = layers[0].raster
     _add_crs(SubElement(root, "projectCrs"), first.place)
     tree = SubElement(root, "layer-tree-group")
@@ -157,7 +181,7 @@ def _project(run: Run, layers: list[ProjectLayer]) -> Element:
         if layer.group not in groups:
             groups[layer.group] = SubElement(tree, "layer-tree-group", name=layer.group, checked=_CHECKED, expanded="1")
         key = re.sub(r"\W", "_", f"{layer.group}_{layer.name}".lower())
-        source = _relative(layer.raster.source, run.out)
+        source = _relative(layer.raster.source, out)
         about = {"id": key, "name": layer.name, "source": source, "providerKey": "gdal", "expanded": "0"}
         about["checked"] = _CHECKED if layer.is_shown else "Qt::Unchecked"
         SubElement(groups[layer.group], "layer-tree-layer", about)

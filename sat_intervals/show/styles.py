@@ -13,18 +13,19 @@ from sat_intervals.show.legend import PIXEL_CLASSES, classify, limits, widest
 # Colours at equal steps of matplotlib's maps.
 VIRIDIS = "#440154", "#3b528b", "#21918c", "#5ec962", "#fde725"
 MAGMA = "#000004", "#51127c", "#b73779", "#fc8961", "#fcfdbf"
+RDBU = "#67001f", "#d6604d", "#dddddd", "#4393c3", "#053061"
 CIVIDIS = "#00224e", "#434e6c", "#7d7c78", "#bcaf6f", "#fee838"
 # QGIS 3.22 is the oldest version the styles are tried with.
 VERSION = "3.22.0"
 HEAD = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
 # Sun of the hillshade: north-west, 45 degrees high. Heights are flattened: noise of 0.1 m is steep between small cells.
 _SUN = {"azimuth": "315", "angle": "45", "zfactor": "0.3", "multidirection": "0"}
-_CUT = 2.0  # share of values below the first and above the last colour, in percent
+CUT = 2.0  # share of values below the first and above the last colour, in percent
 
 
 def colours(band: int, values: np.ndarray, ramp: Sequence[str], *, unit: str = "") -> Element:
     """Return a renderer that spreads colours from the 2nd to the 98th percentile of values; NaN are left out."""
-    return _ramped(band, np.linspace(*limits(values, cut=_CUT), len(ramp)), ramp, unit)
+    return _ramped(band, np.linspace(*limits(values, cut=CUT), len(ramp)), ramp, unit)
 
 
 def shares(band: int) -> Element:
@@ -34,8 +35,13 @@ def shares(band: int) -> Element:
 
 def widths(band: int, values: np.ndarray, *, unit: str) -> Element:
     """Return a renderer of widths from 0 to their 98th percentile; small ones get more colours, by square roots."""
-    places = widest(values, _CUT) * np.linspace(0, 1, len(MAGMA)) ** 2
+    places = widest(values, CUT) * np.linspace(0, 1, len(MAGMA)) ** 2
     return _ramped(band, places, MAGMA, unit)
+
+
+def diverging(band: int, end: float, *, unit: str = "") -> Element:
+    """Return a renderer of changes, from red at minus ``end`` over grey to blue."""
+    return _ramped(band, np.linspace(-end, end, len(RDBU)), RDBU, unit)
 
 
 def _ramped(band: int, places: np.ndarray, ramp: Sequence[str], unit: str = "") -> Element:
@@ -55,7 +61,7 @@ def grey(band: int, values: np.ndarray) -> Element:
     """Return a renderer of an image, from the 2nd to the 98th percentile of its values."""
     renderer = _renderer("singlebandgray", grayBand=band, gradient="BlackToWhite")
     stretch = SubElement(renderer, "contrastEnhancement")
-    first, last = limits(values, cut=_CUT)
+    first, last = limits(values, cut=CUT)
     add_texts(stretch, minValue=f"{first:.6g}", maxValue=f"{last:.6g}", algorithm="StretchToMinimumMaximum")
     return renderer
 

@@ -14,7 +14,7 @@ from sat_intervals.results import open_run
 
 # Commands that print figures.
 WITH_JSON = (
-    "batch", "calibrate", "demo", "dsm", "evaluate", "match", "plan", "range", "rectify",
+    "batch", "calibrate", "change", "demo", "dsm", "evaluate", "match", "plan", "range", "rectify",
     "reference", "status", "surface", "triangulate",
 )  # fmt: skip
 

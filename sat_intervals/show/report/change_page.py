@@ -1,0 +1,24 @@
+"""Write ``report.html`` of a change of height."""
+
+import base64
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from sat_intervals.raster.publishing import write_file
+
+_HEAD = """<!DOCTYPE html><html lang="en"><meta charset="utf-8"><title>Change of height</title>
+<style>body { font: 15px sans-serif; margin: 2em } th { text-align: left; padding-right: 2em } img { max-width: 100% }
+</style><h1>Change of height</h1>"""
+
+
+def write_change_page(out: Path, report: dict[str, Any], lines: list[str]) -> Path:
+    """Write the page of a folder of `change`: files, lines, and the map if `plot` has drawn it; return its path."""
+    picture = out / "change.png"
+    shown = "<p>sat-intervals plot draws the map: then make this page again.</p>"
+    if picture.exists():
+        shown = f'<img alt="map" src="data:image/png;base64,{base64.b64encode(picture.read_bytes()).decode()}">'
+    told = [f"{report['before']} to {report['after']}", *lines, *report["warnings"]]
+    page = "".join([_HEAD, *(f"<p>{escape(line)}</p>\n" for line in told), shown, "</html>\n"])
+    write_file(out / "report.html", page.encode())
+    return out / "report.html"
