@@ -14,7 +14,7 @@ PARALLEL := -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 # Python keeps the bytecode of what it imports: each process would otherwise compile it again, in seconds.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-marked test-all lint bench bench-seams surface-bounds ablation tune calibration coverage pictures docs dist clean
+.PHONY: demo test test-marked test-all lint bench bench-seams surface-bounds change-bench ablation tune calibration coverage pictures docs dist clean
 
 demo: $(VENV)/.has-plot
 	$(BIN)/sat-intervals demo demo-out --overwrite --size 800 800
@@ -62,6 +62,10 @@ calibration: $(VENV)/.has-mccnn
 surface-bounds: $(VENV)/.has-dsm
 	$(BIN)/python -W ignore tests/benchmarks/surface_bounds.py
 
+# The tables of docs/change.md, on the images of SAT_INTERVALS_SHARED and exact scenes; half an hour.
+change-bench: $(VENV)/.has-dsm
+	$(BIN)/python -W ignore tests/benchmarks/change.py
+
 # The tables of docs/coverage.md, on the same pairs; about five minutes after `make calibration`, else half an hour more.
 coverage: $(VENV)/.has-mccnn
 	$(BIN)/python -W ignore tests/benchmarks/coverage_tables.py
@@ -83,7 +87,9 @@ pictures: $(VENV)/.has-dsm,plot
 	$(BIN)/sat-intervals surface $(MANY)/003.tif $(MANY)/004.tif demo-out/two --resolution 0.5 --band 2 --overwrite --quiet
 	$(BIN)/sat-intervals surface $(sort $(wildcard $(MANY)/0*.tif)) demo-out/many --resolution 0.5 --band 2 --overwrite --quiet
 	$(BIN)/python docs/pictures/many.py $(MANY)/lidar_west.tif demo-out/two demo-out/many demo-out/many.png
-	for name in overview profile wavefronts staircase rows surface many; do $(BIN)/python -c 'import sys; from PIL import Image; Image.open(sys.argv[1]).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(sys.argv[2], optimize=True)' demo-out/$$name.png .github/pictures/$$name.png; done
+	$(BIN)/sat-intervals surface $(MANY)/005.tif $(MANY)/006.tif demo-out/later --resolution 0.5 --band 2 --overwrite --quiet
+	$(BIN)/python docs/pictures/change.py demo-out/two demo-out/later demo-out/change demo-out/change.png
+	for name in overview profile wavefronts staircase rows surface many change; do $(BIN)/python -c 'import sys; from PIL import Image; Image.open(sys.argv[1]).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(sys.argv[2], optimize=True)' demo-out/$$name.png .github/pictures/$$name.png; done
 
 # The documentation site, in site/; a warning is an error. Pictures of the gallery are made by running the commands.
 docs: $(VENV)/.has-docs,dsm,plot
