@@ -58,7 +58,8 @@ class Epoch:
         column, row = (x - own.c) / own.a - 0.5, (y - own.f) / own.e - 0.5
         reach = max(1.0, grid.a / resolution_of(self.path, place))
         first, last = (row.min() - reach, column.min() - reach), (row.max() + reach + 1, column.max() + reach + 1)
-        window = Window.around(first, last).clipped(Window(0, 0, *self.shape))
+        is_near = np.isfinite([*first, *last]).all()  # else too far for the projection
+        window = Window.around(first, last).clipped(Window(0, 0, *self.shape)) if is_near else Window(0, 0, 0, 0)
         if not (window.height and window.width):
             return np.full((3, *shape), np.nan)
         bands = self.read(window)

@@ -163,6 +163,8 @@ def test_change__refuses_in_one_line(dates, changed, tmp_path):
     refused(["change", before, degrees, tmp_path, "--sigma", 1], "degrees.tif", "metres")
     far = write_date(tmp_path / "far.tif", 1, first=(90_000, 0))
     refused(["change", before, far, tmp_path], "same place")
+    other_side = write_date(tmp_path / "side.tif", 1, crs="EPSG:32731")
+    refused(["change", before, other_side, tmp_path, "--no-register"], "same place")
 
 
 @pytest.mark.peer("matplotlib")
