@@ -23,6 +23,8 @@ _TILE = 1024  # side of a tile in cells: some hundred megabytes
 _STRIP_CELLS, _LOWEST = 1 << 21, 64
 _LISTED = 1 << 24  # bounds listed for the medians of a tile: 4 bytes each
 _STEPS, _WIDEST = 50, 1000  # widths are counted in steps of 2 cm, up to so many metres
+# Share of the weights below the height of runs that are apart; cells between heights that are.
+_LOW, _APART = 1 / 3, 2.0
 _NARROWEST = 0.01  # metres: narrower intervals weigh as much as one of this width
 Strip = tuple[int, np.ndarray, Counter[str]]  # see `strips`
 WIDE = 20.0  # metres: half widths from this on are reported as a share
@@ -63,7 +65,7 @@ def _strips(
 
     def tile(window: Window) -> tuple[np.ndarray, Counter[str]]:
         gathered, counts = zip(*(cloud.splat(cells, window, radius, ended) for cloud in clouds), strict=True)
-        bands = fused(gathered)
+        bands = fused(gathered, _APART * cells.resolution)
         poor = without_poor_cells(bands, None, choices.min_confidence)
         return bands, sum(counts, Counter(poor_cells=poor))
 
@@ -104,12 +106,15 @@ def _tile_size(clouds: Sequence[PointCloud], cells: Cells, radius: float, choice
     return rows, columns
 
 
-def fused(gathered: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the bands of SURFACE, ``(6, rows, columns)`` float32, from the cells of runs, see `PointCloud.splat`."""
+def fused(gathered: Sequence[np.ndarray], apart: float) -> np.ndarray:
+    """Return the bands of SURFACE, ``(6, rows, columns)`` float32, from the cells of runs, see `PointCloud.splat`.
+
+    ``apart``: metres between heights of runs from which they are not averaged.
+    """
     # Heights and middles of intervals are means weighted by ``1 / width^2``, widths those of the mean weight, not
-    # divided by the root of the number of runs: errors of pairs of one place are correlated. Where intervals do not
-    # meet, their hull is taken, and the height of the narrowest: a mean may be in none of them. Without any, all
-    # heights count.
+    # divided by the root of the number of runs: errors of pairs of one place are correlated. Heights that are apart
+    # have no mean: beside walls matching widens roofs, so the one with a third of the weights below it is taken. Where
+    # intervals do not meet, it is their hull. Without any, all heights count.
     layers = np.stack(gathered, axis=1)  # of each layer, the cells of all runs
     count = layers[COUNT].sum(axis=0)
     weights = np.where(layers[COUNT] > 0, layers[WEIGHT], np.nan)
@@ -120,9 +125,10 @@ def fused(gathered: Sequence[np.ndarray]) -> np.ndarray:
     meeting = np.fmax.reduce(lowers) <= np.fmin.reduce(uppers)
     if len(gathered) > 1:
         width = np.maximum(uppers - lowers, _NARROWEST)
+        narrowness = np.where(np.isfinite(width).any(axis=0), 1 / width, weights)
         height = np.where(np.isfinite(width).any(axis=0), _mean(width**-2, heights), height)
-        narrowest = np.where(np.isnan(width), np.inf, uppers - lowers).argmin(axis=0)[np.newaxis]
-        height = np.where(several & ~meeting, np.take_along_axis(heights, narrowest, axis=0)[0], height)
+        differ = np.fmax.reduce(heights) - np.fmin.reduce(heights) > apart
+        height = np.where(differ, _low(narrowness, heights), height)
         middle, half = _mean(width**-2, (lowers + uppers) / 2), _mean(width**-2, width**2) ** 0.5 / 2
         lower = np.where(several & meeting, middle - half, np.fmin.reduce(lowers))
         upper = np.where(several & meeting, middle + half, np.fmax.reduce(uppers))
@@ -135,6 +141,15 @@ def fused(gathered: Sequence[np.ndarray]) -> np.ndarray:
         "agreement": np.where(several, meeting, np.nan),
     }
     return np.stack([bands[band.name] for band in SURFACE]).astype(np.float32)
+
+
+def _low(weights: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the least value along the first axis with a share `_LOW` of the weights up to it; NaN without anything."""
+    weights = np.where(np.isfinite(values + weights), weights, 0.0)
+    order = np.where(weights > 0, values, np.inf).argsort(axis=0)
+    upto = np.take_along_axis(weights, order, axis=0).cumsum(axis=0)
+    first = (upto >= _LOW * upto[-1]).argmax(axis=0)[np.newaxis]
+    return np.asarray(np.take_along_axis(values, np.take_along_axis(order, first, axis=0), axis=0)[0])
 
 
 def _mean(weights: np.ndarray, values: np.ndarray) -> np.ndarray:

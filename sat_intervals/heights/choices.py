@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Literal, get_args
 
 from sat_intervals.config import HeightCalibration, Interval
@@ -30,6 +31,9 @@ class SurfaceChoices:
         Leave out cells of lower confidence, 0 to 1.
     calibration
         Margins that move the bounds, before wide intervals are left out.
+    aligns, reference
+        Whether several runs are moved onto each other first, and a raster of heights, above the same datum, that each
+        run is moved onto.
     """
 
     bounds: Bounds | None = None
@@ -39,6 +43,8 @@ class SurfaceChoices:
     max_width: float | None = None
     min_confidence: float | None = None
     calibration: HeightCalibration | None = None
+    aligns: bool = True
+    reference: Path | None = None
 
     def __post_init__(self) -> None:
         if self.bounds is not None and self.bounds not in BOUNDS:

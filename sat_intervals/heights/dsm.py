@@ -9,7 +9,8 @@ import numpy as np
 
 from sat_intervals.config import Calibration, Interval
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.heights.cells import CellCounts, strips
+from sat_intervals.heights.alignment import aligned
+from sat_intervals.heights.cells import CellCounts, Strip, strips
 from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.geometry import FILE, Geometry, geometry_of
 from sat_intervals.heights.lattice import Ground, joined, on_map
@@ -63,7 +64,8 @@ def make_surface(
     Returns
     -------
     ``crs``, ``rows``, ``columns``, ``points``, ``filled`` (share of cells with a height), ``disagreeing`` (share of the
-    cells of several runs whose intervals do not overlap, None if there are none), ``without_intervals`` (folders of
+    cells of several runs whose intervals do not overlap, None if there are none), ``shifts`` (of each run in metres,
+    with its standard deviation, None if unknown; empty if nothing was aligned), ``without_intervals`` (folders of
     runs without intervals); ``bounds``; ``calibration`` (its name, None without one); ``median_half_width`` (metres)
     and ``wide``, the share of cells with bounds whose half width exceeds 20 m, both None without bounds; ``outliers``,
     ``open``, ``border`` and ``poor_cells``, the numbers of points and cells left out; ``geometry``, for each folder,
@@ -76,39 +78,58 @@ def make_surface(
         the file cannot be written.
     """
     path, geoid = Path(path), None if geoid is None else Path(geoid)
-    given = [geoid, *(files_of(str(resolution)) if isinstance(resolution, Path) and resolution.exists() else ())]
+    choices = choices or SurfaceChoices()
+    given = [geoid, choices.reference, *_files_of(resolution)]
     grid, resolution, crs, radius = checked_cells(resolution, crs, radius, geoid)
     geometries = _geometries(outs, path, given, progress)
     runs = [geometry.run for geometry in geometries]
     intervals = [run.config.interval for run in runs]
-    choices = (choices or SurfaceChoices()).for_intervals(intervals)
+    choices = choices.for_intervals(intervals)
     tags = surface_tags([run.report["finished"] for run in runs], intervals, choices, resolution, radius)
     tags["HEIGHTS"] = f"above {geoid or 'the WGS 84 ellipsoid'}"
-    projection = Projection(crs or utm_of(*geometries[0].lattice.middle), geoid)
-    projection.check(*geometries[0].lattice.middle)
+    middle = geometries[0].lattice.middle
+    projection = Projection(crs or utm_of(*middle), geoid)
+    projection.check(*middle)
     clouds = [PointCloud(one.run, on_map(one.lattice, projection, str(one.run.out)), choices) for one in geometries]
-    tally = CellCounts()
+    crs = projection.crs
     with ThreadPoolExecutor(usable_cores()) as threads:
-        cells = _cells(threads, clouds, resolution, radius, grid)
-        place = north_up(projection.crs, cells.left, cells.top, cells.resolution)
-        with OutputWriter(path.parent, [surface_file(path.name)], cells.rows, cells.columns, place, tags) as writer:
-            for row, bands, counts in strips(threads, clouds, cells, radius, choices):
-                tally.add(bands, counts)
-                writer.write(row, bands)
-                progress("cells", row + bands.shape[1], cells.rows)
-            progress("files", 0, 1)
-            writer.publish()
-            progress("files", 1, 1)
+        cells, shifts = _cells(threads, clouds, resolution, radius, grid), list[dict[str, Any]]()
+        if choices.reference or (choices.aligns and len(clouds) > 1):
+            clouds, shifts = aligned(threads, clouds, cells, crs, radius, choices.reference)
+            cells = _cells(threads, clouds, resolution, radius, grid)
+        tally = _write(path, strips(threads, clouds, cells, radius, choices), cells, crs, tags, progress)
     return {
-        "crs": projection.crs,
+        "crs": crs,
         "rows": cells.rows,
         "columns": cells.columns,
         **tally.report(cells.rows * cells.columns),
         "bounds": choices.bounds,
         "calibration": choices.calibration and choices.calibration.name,
+        "shifts": shifts,
         "without_intervals": [str(run.out) for run in runs if run.config.interval is None],
         "geometry": {str(one.run.out): one.report for one in geometries},
     }
+
+
+def _files_of(resolution: float | Path) -> Sequence[str]:
+    """Return the files of the raster whose grid is taken, if there is one."""
+    return files_of(str(resolution)) if isinstance(resolution, Path) and resolution.exists() else ()
+
+
+def _write(
+    path: Path, parts: Iterable[Strip], cells: Cells, crs: str, tags: dict[str, str], progress: Progress
+) -> CellCounts:
+    """Write the strips of a surface; return what they have."""
+    tally, place = CellCounts(), north_up(crs, cells.left, cells.top, cells.resolution)
+    with OutputWriter(path.parent, [surface_file(path.name)], cells.rows, cells.columns, place, tags) as writer:
+        for row, bands, counts in parts:
+            tally.add(bands, counts)
+            writer.write(row, bands)
+            progress("cells", row + bands.shape[1], cells.rows)
+        progress("files", 0, 1)
+        writer.publish()
+        progress("files", 1, 1)
+    return tally
 
 
 def _geometries(

@@ -73,7 +73,7 @@ class PointCloud:
     def __init__(self, run: Run, lattice: Lattice, choices: SurfaceChoices) -> None:
         """``lattice`` is that of the run, see `on_map`."""
         self.run, self.ground = run, Ground(lattice)
-        self._choices = choices
+        self.choices = choices
 
     def extent(self, threads: ThreadPoolExecutor) -> Extent | None:
         """Return the extent of the points that contribute, None without any, from the outermost windows inwards."""
@@ -123,9 +123,9 @@ class PointCloud:
             placed = [column.astype(np.float32).ravel(), row.astype(np.float32).ravel()]
             placed += [values.ravel() for values in points[2:]]
             splat(*placed, reach, gathered)
-            if self._choices.bounds == "median":
+            if self.choices.bounds == "median":
                 near.append(_within(placed[:5], window, max(reach, 0.5)))
-        if self._choices.bounds == "median":
+        if self.choices.bounds == "median":
             _set_medians(gathered, near, reach)
         return gathered, counts
 
@@ -141,13 +141,13 @@ class PointCloud:
         """Return x, y and height ``(3, rows, columns)`` of the points that contribute, and masks of those left out."""
         places = self.ground.lattice.points(window, bands.matched)
         height, left_out = places[2], dict[str, np.ndarray]()
-        if self._choices.outliers is not None:
-            left_out["outliers"] = self._outlying(window, self._choices.outliers)
+        if self.choices.outliers is not None:
+            left_out["outliers"] = self._outlying(window, self.choices.outliers)
             height[left_out["outliers"]] = np.nan
-        if not self._choices.keeps_open:
+        if not self.choices.keeps_open:
             left_out["open"] = np.isfinite(height) & (bands.validity & np.uint16(OPEN_BELOW | OPEN_ABOVE) != 0)
             height[left_out["open"]] = np.nan
-        if not self._choices.keeps_border:  # only wrong candidates may be left there
+        if not self.choices.keeps_border:  # only wrong candidates may be left there
             is_doubtful = (bands.validity & np.uint16(RANGE_INCOMPLETE) != 0) & (bands.confidence < _DOUBTFUL)
             left_out["border"] = np.isfinite(height) & is_doubtful
             height[left_out["border"]] = np.nan

@@ -163,7 +163,7 @@ def test_make_surface__of_several_runs_is_their_mean_where_they_meet(tmp_path):
         cells = surface[:, i, [j, j + 10, j + 20]]
         assert_allclose(cells[BAND["height_lower"]], [9.5, 9, 9], atol=1e-4)
         assert_allclose(cells[BAND["height_upper"]], [12.5, 32, 12], atol=1e-4)
-        assert_allclose(cells[BAND["height"]], [10.5, 30, 10], atol=1e-4)
+        assert_allclose(cells[BAND["height"]], [10.5, 10, 10], atol=1e-4)
         assert_allclose(cells[BAND["confidence"]], [0.5, 0.5, 1.0], atol=1e-4)
         assert_array_equal(cells[BAND["count"]], [2, 2, 1])
         assert_array_equal(cells[BAND["agreement"]], [1, 0, np.nan])
@@ -180,18 +180,53 @@ def test_make_surface__of_several_runs_follows_the_narrow_intervals(tmp_path):
     assert_allclose(surface[:3, i, j], [10.9, 10.95 - 1.3416 / 2, 10.95 + 1.3416 / 2], atol=1e-4)
 
 
-def test_make_surface__of_runs_that_do_not_meet_has_a_height_that_one_of_them_has(tmp_path):
+def test_make_surface__of_runs_that_are_apart_has_the_height_with_a_third_of_the_weights_below(tmp_path):
     random = np.random.default_rng(4)
     x, y = np.meshgrid(np.arange(0.5, 30), -np.arange(0.5, 20))
     heights, halves = random.uniform(0, 60, (3, *x.shape)), random.uniform(0.5, 4, (3, *x.shape))
     given = zip(heights, halves, halves, strict=True)
     runs = [write_points(tmp_path / str(number), x, y, *one) for number, one in enumerate(given)]
-    surface, place, _ = surface_of(runs, tmp_path, radius=0.1)
+    surface, place, report = surface_of(runs, tmp_path, radius=0.1, choices=SurfaceChoices(aligns=False))
     i, j = cell_of(place, LEFT + x, TOP + y)
-    apart = surface[BAND["agreement"], i, j] == 0
-    narrowest = np.take_along_axis(heights, halves.argmin(axis=0)[np.newaxis], axis=0)[0]
+    apart = np.ptp(heights, axis=0) > 2
+    order = heights.argsort(axis=0)
+    upto = np.take_along_axis(1 / halves, order, axis=0).cumsum(axis=0)
+    lowest = np.take_along_axis(heights, order, axis=0)
+    expected = np.where(upto[0] >= upto[2] / 3, lowest[0], np.where(upto[1] >= upto[2] / 3, lowest[1], lowest[2]))
     assert apart.mean() > 0.9
-    assert_allclose(surface[BAND["height"], i, j][apart], narrowest[apart], atol=1e-3)
+    assert_allclose(surface[BAND["height"], i, j][apart], expected[apart], atol=1e-3)
+    assert report["shifts"] == []
+
+
+def test_make_surface__moves_runs_onto_each_other_or_a_reference(tmp_path):
+    x, y = np.meshgrid(np.arange(0.5, 90, 0.5), -np.arange(0.5, 80, 0.5))
+
+    def ground(x, y):
+        hills = 6 * np.sin(0.11 * x + 0.03 * y) + 5 * np.cos(0.08 * y - 0.02 * x)
+        return 500 + hills + 4 * np.sin(0.23 * x - 0.17 * y) + 3 * np.cos(0.29 * y + 0.07 * x)
+
+    # where the runs say that a place is, and what is there
+    off = np.array([[0.9, -1.2, 0.4], [-0.3, 0.6, -1.0], [-0.6, 0.6, 0.6]])
+    random = np.random.default_rng(1)
+    runs = [
+        write_points(tmp_path / name, x + east, y + north, ground(x, y) + up + random.normal(0, 0.1, x.shape))
+        for name, (east, north, up) in zip("abc", off, strict=True)
+    ]
+    surface, place, report = surface_of(runs, tmp_path, radius=0.8)
+    found = np.array([one["shift"] for one in report["shifts"]])
+    assert_allclose(found, -off, atol=0.15)
+    assert_allclose(found.sum(axis=0), 0, atol=1e-6)
+    assert all(0 < deviation < 0.1 for one in report["shifts"] for deviation in one["deviation"])
+    assert report["disagreeing"] < 0.01
+    _, _, plain = surface_of(runs, tmp_path, radius=0.8, choices=SurfaceChoices(aligns=False))
+    assert plain["shifts"] == []
+    assert plain["disagreeing"] > 0.02
+    row, column = np.indices(surface.shape[1:]) + 0.5
+    heights = ground(place.c + column - LEFT, place.f - row - TOP) + 3
+    write_layer(tmp_path / "reference.tif", heights, np.nan, north_up("EPSG:32631", place.c, place.f, 1.0))
+    choices = SurfaceChoices(reference=tmp_path / "reference.tif")
+    _, _, moved = surface_of(runs, tmp_path, radius=0.8, choices=choices)
+    assert_allclose([one["shift"] for one in moved["shifts"]], -off + [0, 0, 3], atol=0.15)
 
 
 def test_make_surface__does_not_depend_on_its_tiles(tmp_path, monkeypatch):

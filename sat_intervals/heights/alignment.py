@@ -1,0 +1,100 @@
+"""Align runs of one place: the shifts in space that make their surfaces fit each other.
+
+Models of images are off by a pixel or so, and surfaces of their pairs by as much. Each two surfaces are registered on
+blocks of ground that both have; least squares over all these shifts give one of each run, with mean 0.
+"""
+
+import threading
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sat_intervals.heights.point_cloud import Cells, PointCloud
+from sat_intervals.kernels.gridding import mean_heights
+from sat_intervals.kernels.registration import REACH, every_nth, put_together, register, spread_blocks
+from sat_intervals.raster import north_up, read_heights
+from sat_intervals.tiling import Window
+
+# Smallest side of the blocks that register, in cells.
+_SMALLEST = 16
+# What pulls the mean of all shifts to 0, or the reference, in inverse metres.
+_HELD = 1e3
+
+
+def aligned(
+    threads: ThreadPoolExecutor,
+    clouds: Sequence[PointCloud],
+    cells: Cells,
+    crs: str,
+    radius: float,
+    reference: Path | None = None,
+) -> tuple[list[PointCloud], list[dict[str, Any]]]:
+    """Move the points of runs onto each other, or onto a raster of reference heights.
+
+    Also return the shift of each run, easting, northing and height in metres, with its ``deviation``, None if unknown.
+    """
+    count = len(clouds) + bool(reference)
+    heights_only = [PointCloud(one.run, one.ground.lattice, replace(one.choices, bounds="envelope")) for one in clouds]
+    found = dict[tuple[int, int], list[tuple[np.ndarray, ...]]]()
+    cores = spread_blocks(Window(0, 0, cells.rows, cells.columns), _SMALLEST)
+    for heights in threads.map(lambda core: list(_heights(heights_only, cells, crs, radius, reference, core)), cores):
+        for one, other in combinations(range(count), 2):
+            part = _part(heights[one], heights[other])
+            if part is not None:
+                found.setdefault((one, other), []).append(part)
+    pairs = {pair: register(put_together(parts, cells.resolution, moves=-1)) for pair, parts in found.items()}
+    known = {pair: one for pair, one in pairs.items() if one}
+    shifts, deviations = _solved(known, count, has_reference=bool(reference))
+    moved, report = [], []
+    for cloud, shift, deviation in zip(clouds, shifts, deviations, strict=False):
+        lattice = cloud.ground.lattice
+        moved.append(PointCloud(cloud.run, replace(lattice, nodes=lattice.nodes + shift), cloud.choices))
+        known_deviation = [one if np.isfinite(one) else None for one in deviation.tolist()]
+        report.append({"run": str(cloud.run.out), "shift": shift.tolist(), "deviation": known_deviation})
+    return moved, report
+
+
+def _heights(
+    clouds: Sequence[PointCloud], cells: Cells, crs: str, radius: float, reference: Path | None, core: Window
+) -> Iterator[np.ndarray]:
+    """Yield the heights of each run and of the reference on a block and around it: ``(rows, columns)``, NaN if none."""
+    around = core.grown(REACH + 1, REACH + 1)
+    for cloud in clouds:
+        heights = mean_heights(cloud.splat(cells, around, radius, threading.Event())[0])
+        yield heights.astype(np.float32)  # those of all blocks are kept
+    if reference:
+        place = north_up(crs, cells.left, cells.top, cells.resolution).shifted(around)
+        shape = around.height, around.width
+        yield read_heights(reference, place, shape, Window(0, 0, *shape), smooth=True).astype(np.float32)
+
+
+def _part(surface: np.ndarray, heights: np.ndarray) -> tuple[np.ndarray, ...] | None:
+    """Return a surface with columns, rows and heights of points of another one on the block, None without any."""
+    row, column = np.nonzero(np.isfinite(heights[REACH + 1 : -REACH - 1, REACH + 1 : -REACH - 1]))
+    if not (row.size and np.isfinite(surface).any()):
+        return None
+    chosen = every_nth(row.size)
+    row, column = row[chosen] + REACH + 1, column[chosen] + REACH + 1
+    return surface, column.astype(float), row.astype(float), heights[row, column]
+
+
+def _solved(pairs: dict[tuple[int, int], Any], count: int, *, has_reference: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return shifts and deviations, ``(count, 3)``, by weighted least squares over the shifts of pairs."""
+    shifts, deviations = np.zeros((count, 3)), np.full((count, 3), np.nan)
+    for axis in range(3):
+        known = {pair: one for pair, one in pairs.items() if np.isfinite(one.deviation[axis])}
+        rows, values = np.zeros((len(known) + 1, count)), np.zeros(len(known) + 1)
+        for row, ((one, other), found) in enumerate(known.items()):
+            weight = 1 / found.deviation[axis]
+            rows[row, [one, other]], values[row] = (-weight, weight), weight * found.shift[axis]
+        rows[-1, -1 if has_reference else slice(None)] = _HELD
+        inverse = np.linalg.pinv(rows)
+        met = np.unique([number for pair in known for number in pair]).astype(int)
+        shifts[:, axis] = inverse @ values
+        deviations[met, axis] = np.sqrt(np.square(inverse).sum(axis=1))[met]
+    return shifts, deviations
