@@ -21,11 +21,15 @@ _STILL = {"shift": (0.0, 0.0, 0.0), "deviation": (0.0, 0.0, 0.0)}
 
 
 class Difference(NamedTuple):
-    """Height after - before of cells, and standard deviations of its lower and upper side: metres."""
+    """Height after - before of cells, and standard deviations of its lower and upper side: metres.
+
+    ``slopes``: metres of height for a metre to the east, and to the north, ``(2, rows, columns)``.
+    """
 
     height: np.ndarray
     down: np.ndarray
     up: np.ndarray
+    slopes: np.ndarray
 
     @property
     def ratio(self) -> np.ndarray:
@@ -73,12 +77,13 @@ class Pair:
         )
         one, other = self.before.deviations, self.after.deviations
         across, down = self.before.place.pixel_size
-        slopes = np.nan_to_num(np.gradient(ground[0], down, across))[:, *inner]
-        shift = deviation[2] ** 2 + (deviation[1] * slopes[0]) ** 2 + (deviation[0] * slopes[1]) ** 2
+        slopes = np.stack([_slope(ground[0], 1)[inner] / across, -_slope(ground[0], 0)[inner] / down])
+        shift = deviation[2] ** 2 + (deviation[0] * slopes[0]) ** 2 + (deviation[1] * slopes[1]) ** 2
         return Difference(
             then - height,
             np.sqrt(((upper - height) / one) ** 2 + ((then - then_lower) / other) ** 2 + shift),
             np.sqrt(((height - lower) / one) ** 2 + ((then_upper - then) / other) ** 2 + shift),
+            slopes,
         )
 
     def bands(self, found: Difference) -> np.ndarray:
@@ -88,9 +93,20 @@ class Pair:
         return np.stack([found.height, *bounds, probability(found.ratio, self.scale)])
 
 
+def _slope(height: np.ndarray, axis: int) -> np.ndarray:
+    """Return the slope along an axis for a cell: the mean of those to both neighbours, or that to a known one, or 0."""
+    steps = np.diff(height, axis=axis)
+    ends = [np.pad(steps, [side if one == axis else (0, 0) for one in (0, 1)], constant_values=np.nan)
+            for side in ((1, 0), (0, 1))]  # fmt: skip
+    known = np.isfinite(ends).sum(axis=0)
+    return np.asarray(np.nansum(ends, axis=0) / np.maximum(known, 1))
+
+
 def open_pair(before: str | Path, after: str | Path, sigma: float | None, *, registers: bool) -> tuple[Pair, list[str]]:
     """Open surfaces of two dates, register the second, measure what differs without a change; return warnings, too."""
     one, other = open_epoch(before, sigma), open_epoch(after, sigma)
+    if sigma is not None and one.sigma is None and other.sigma is None:
+        raise SatIntervalsError("both surfaces have bounds: leave sigma out")
     if one.level and other.level and one.level != other.level:
         raise SatIntervalsError(
             f"{one.path} has heights {one.level}, {other.path} {other.level}: make both with the same --geoid"
@@ -100,16 +116,21 @@ def open_pair(before: str | Path, after: str | Path, sigma: float | None, *, reg
     resolution, area = resolution_of(other.path, one.place), covered_window(other.path, one.place, one.shape)
     given = Comparison(one.path, other.path, one.shape, one.place, resolution, 1, area)
     moved, warnings = registered(given) if registers else (given, [])
+    if (found := moved.registration) and None in found["deviation"]:
+        warnings.append(
+            "a part of the shift cannot be determined and counts as 0 without an error: flat ground, few common cells, "
+            "or surfaces many cells apart"
+        )
     pair = Pair(one, other, moved.registration)
     blocks = list(Grid(area, _BLOCK))
-    found = [pair.read(block.core) for block in blocks[:: -(-len(blocks) // _BLOCKS)]]
+    parts = [pair.read(block.core) for block in blocks[:: -(-len(blocks) // _BLOCKS)]]
     heights, ratios = (
-        np.concatenate([part[np.isfinite(part)] for part in parts])
-        for parts in ([part.height for part in found], [part.ratio for part in found])
+        np.concatenate([part[np.isfinite(part)] for part in one_of])
+        for one_of in ([part.height for part in parts], [part.ratio for part in parts])
     )
     up = pair.shift[0, 2]
     warnings += check_common(given, ratios.size, float(np.median(heights)) - up if ratios.size else None)
     pair = replace(pair, median=float(np.median(np.abs(ratios))))
     limit = ratio_of(_CHANGED, pair.scale)
-    parts = [np.where(np.abs(part.ratio) < limit, part.ratio, np.nan) for part in found]
-    return replace(pair, correlation=correlation_of(parts, one.place.pixel_size[0])), warnings
+    still = [np.where(np.abs(part.ratio) < limit, part.ratio, np.nan) for part in parts]
+    return replace(pair, correlation=correlation_of(still, one.place.pixel_size[0])), warnings

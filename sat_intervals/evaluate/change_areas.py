@@ -61,10 +61,11 @@ class Areas:
         """``smallest`` area is in square metres."""
         self._pair = pair
         self._cell = float(np.prod(pair.before.place.pixel_size))
-        least = int(np.ceil(smallest / self._cell - 1e-9))
+        least = int(np.clip(np.ceil(smallest / self._cell - 1e-9), 1, signs.size + 1))
         self._runs = [connected(signs, sign, least) for sign in (1, -1)]
         self._risen, fallen = (int(runs[2].max(initial=0)) for runs in self._runs)
-        self._sums = np.zeros((3, 1 + self._risen + fallen))  # cells, differences, deviations
+        # cells, differences, deviations, slopes to the east and to the north
+        self._sums = np.zeros((5, 1 + self._risen + fallen))
 
     def labels(self, window: Window) -> np.ndarray:
         """Return the areas of the cells of a window, 0 elsewhere."""
@@ -75,7 +76,8 @@ class Areas:
     def add(self, window: Window) -> np.ndarray:
         """Return the bands of a strip, ``(5, rows, columns)``."""
         found, labels = self._pair.read(window), self.labels(window)
-        for sums, values in zip(self._sums, (1.0, found.height, (found.down + found.up) / 2), strict=True):
+        of_cells = 1.0, found.height, (found.down + found.up) / 2, *found.slopes
+        for sums, values in zip(self._sums, of_cells, strict=True):
             sums += np.bincount(labels.ravel(), np.where(labels > 0, values, 0.0).ravel(), sums.size)
         bands = self._pair.bands(found)
         change = np.where(labels > self._risen, -1.0, np.minimum(labels, 1.0))
@@ -93,12 +95,20 @@ class Areas:
                 window = Window.around(first, (rows[own].max() + 1, stop[own].max()))
                 yield outline(self.labels(window) == before + number, self._pair.before.place.shifted(window))
 
+    @property
+    def _common(self) -> np.ndarray:
+        """Return errors of mean differences by the shift, which all areas share: ``(3, areas)`` with their signs."""
+        cells, *_, east, north = self._sums[:, 1:]
+        means = np.stack([east / cells, north / cells, np.ones_like(cells)])
+        return np.asarray(self._pair.shift[1, :, np.newaxis] * means)
+
     def figures(self) -> dict[str, np.ndarray]:
         """Return of all areas sign, area, mean difference and its bounds, volume and its standard deviation."""
-        cells, differences, deviations = self._sums[:, 1:]
+        cells, differences, deviations = self._sums[:3, 1:]
         correlation, area, mean = self._pair.correlation, cells * self._cell, differences / cells
         shares = np.array([correlation.within(one) for one in area])
-        deviation = np.hypot(deviations / cells * np.sqrt(correlation.variance * shares), self._pair.shift[1, 2])
+        own = deviations / cells * np.sqrt(correlation.variance * shares)
+        deviation = np.sqrt(own**2 + (self._common**2).sum(axis=0))
         half = self._pair.before.deviations * deviation
         return {
             "change": np.where(np.arange(area.size) < self._risen, 1, -1), "area": area,
@@ -106,13 +116,13 @@ class Areas:
             "volume": area * mean, "volume_deviation": area * deviation,
         }  # fmt: skip
 
-    def report(self) -> dict[str, Any]:
-        """Return numbers of areas and their cells, and volumes with standard deviations; the shift is one for all."""
-        figures, volume = self.figures(), {}
-        risen = figures["change"] > 0
+    def report(self, figures: dict[str, np.ndarray]) -> dict[str, Any]:
+        """Return numbers of areas and their cells, and volumes with standard deviations."""
+        risen, volume, common = figures["change"] > 0, {}, figures["area"] * self._common
         for name, chosen in (("gained", risen), ("lost", ~risen), ("net", risen | ~risen)):
-            shifts = figures["area"][chosen] * self._pair.shift[1, 2]
-            variance = (figures["volume_deviation"][chosen] ** 2 - shifts**2).sum() + shifts.sum() ** 2
-            volume[name] = [float(figures["volume"][chosen].sum()), float(np.sqrt(variance))]
+            shared = common[:, chosen]
+            own = (figures["volume_deviation"][chosen] ** 2).sum() - (shared**2).sum()
+            variance = own + (shared.sum(axis=1) ** 2).sum()
+            volume[name] = [float(figures["volume"][chosen].sum()), float(np.sqrt(max(variance, 0.0)))]
         cells = {name: int(self._sums[0, 1:][one].sum()) for name, one in (("risen", risen), ("fallen", ~risen))}
         return {"areas": risen.size, "cells": cells, "volume": volume}

@@ -12,6 +12,8 @@ from sat_intervals.raster import Georeferencing
 from sat_intervals.raster.polygons import Polygon
 from sat_intervals.raster.publishing import write_file
 
+_POLYGONS = 3, 6  # types of shapely
+
 
 def write_polygons(
     path: Path, polygons: Sequence[Polygon], fields: Mapping[str, np.ndarray], place: Georeferencing
@@ -35,7 +37,8 @@ def read_polygons(path: Path) -> tuple[str, list[Polygon]]:
         from pyogrio.raw import read
 
         known, _, geometry, _ = read(path, columns=[])
-        polygons = [shapely.geometry.mapping(one) for one in shapely.from_wkb(geometry)]
+        found = shapely.from_wkb(geometry)
+        polygons = [shapely.geometry.mapping(one) for one in found[np.isin(shapely.get_type_id(found), _POLYGONS)]]
     if not known["crs"]:
         raise SatIntervalsError(f"{path} has no CRS: declare it, such as with ogr2ogr -a_srs EPSG:32637")
     return known["crs"], polygons

@@ -19,8 +19,9 @@ _LAGS = np.unique(np.geomspace(1, 128, 16).astype(int))  # cells
 
 def probability(ratio: np.ndarray, scale: float) -> np.ndarray:
     """Return how often a ratio is as large, or larger, without a change."""
-    sine = np.abs(ratio) / np.hypot(ratio, 2 * scale)
-    return np.asarray(1 - 1.5 * sine + 0.5 * sine**3)
+    size, hypotenuse = np.abs(ratio), np.hypot(ratio, 2 * scale)
+    rest = 4 * scale**2 / (hypotenuse * (hypotenuse + size))  # 1 - y, exact of large ratios
+    return np.asarray(rest**2 * (1.5 - 0.5 * rest))
 
 
 def ratio_of(rate: float, scale: float) -> float:

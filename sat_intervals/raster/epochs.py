@@ -6,19 +6,21 @@ from statistics import NormalDist
 
 import numpy as np
 from pyproj import Transformer
+from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.change import drawn
 from sat_intervals.products import SURFACE
 from sat_intervals.raster.georeferencing import Georeferencing, horizontal_name
-from sat_intervals.raster.heightfield import warn_of_no_data
+from sat_intervals.raster.heightfield import is_ground, warn_of_no_data
 from sat_intervals.raster.images import opened
 from sat_intervals.raster.layers import read_layers
 from sat_intervals.raster.projection import transformed
-from sat_intervals.raster.surfaces import read_heights, read_place, resolution_of
+from sat_intervals.raster.surfaces import is_change, read_heights, read_place, resolution_of
 from sat_intervals.tiling import Window
 
 _COVERAGE = 0.9  # of bounds that are made of standard deviations
+_LEAST = 2  # rows and columns: slopes need them
 _DEVIATIONS = "sigma", "std", "error", "uncertainty"  # words in names of bands
 
 
@@ -44,8 +46,8 @@ class Epoch:
         if self.sigma is None and self.band is None:
             return read_layers(self.path, window)[:3].astype(np.float64)
         height = read_heights(self.path, self.place, self.shape, window)
-        sigma = self.sigma if self.band is None else read_layers(self.path, window, self.band)
-        half = self.deviations * np.asarray(sigma, np.float64)
+        height[~is_ground(height)] = np.nan  # undeclared no data
+        half = self.deviations * (_sigma_of(self.path, window, self.band) if self.band else self.sigma or 0.0)
         return np.stack([height, height - half, height + half])
 
     def drawn(self, place: Georeferencing, shape: tuple[int, int]) -> np.ndarray:
@@ -55,7 +57,8 @@ class Epoch:
         if place.crs != self.place.crs:
             crs, target = (horizontal_name(one.crs) for one in (place, self.place) if one.crs)
             x, y = transformed(Transformer.from_crs(crs, target, always_xy=True), x, y)
-        column, row = (x - own.c) / own.a - 0.5, (y - own.f) / own.e - 0.5
+        # rounded: a neighbour with a weight of rounding errors would give its bounds
+        column, row = np.round((x - own.c) / own.a - 0.5, 6), np.round((y - own.f) / own.e - 0.5, 6)
         reach = max(1.0, grid.a / resolution_of(self.path, place))
         first, last = (row.min() - reach, column.min() - reach), (row.max() + reach + 1, column.max() + reach + 1)
         is_near = np.isfinite([*first, *last]).all()  # else too far for the projection
@@ -67,13 +70,25 @@ class Epoch:
         return np.asarray(found.reshape(3, *shape))
 
 
+def _sigma_of(path: Path, window: Window, band: int) -> np.ndarray:
+    """Read standard deviations, scaled, NaN where they are unknown or not positive."""
+    with opened(str(path), window) as dataset:
+        values = dataset.read(
+            band, window=RasterioWindow(window.column, window.row, window.width, window.height), masked=True
+        )
+        sigma = values.astype(np.float64).filled(np.nan) * dataset.scales[band - 1] + dataset.offsets[band - 1]
+    return np.where(sigma > 0, sigma, np.nan)
+
+
 def open_epoch(path: str | Path, sigma: float | None = None) -> Epoch:
     """Open a surface model, or the folder that has it as dsm.tif; ``sigma`` in metres is for those without bounds."""
     path = Path(path) / "dsm.tif" if Path(path).is_dir() else Path(path)
     shape, place = read_place(path)
     assert place.crs is not None
-    if not place.crs.is_projected:
-        raise SatIntervalsError(f"{path} has cells in degrees: resample it to a map in metres, such as with gdalwarp")
+    if not place.crs.is_projected or place.crs.linear_units_factor[1] != 1:
+        raise SatIntervalsError(f"{path} is on no map in metres: resample it to one, such as with gdalwarp")
+    if min(shape) < _LEAST:
+        raise SatIntervalsError(f"{path} has {shape[0]} x {shape[1]} cells: give a surface")
     with opened(str(path)) as dataset:
         names, tags = dataset.descriptions, dataset.tags()
     level = tags.get("HEIGHTS", "")
@@ -81,7 +96,11 @@ def open_epoch(path: str | Path, sigma: float | None = None) -> Epoch:
         if "COVERAGE" not in tags:
             raise SatIntervalsError(f"{path} has no bounds with a coverage: make it of runs with --coverage")
         return Epoch(path, shape, place, level, float(tags["COVERAGE"]))
-    bands = [n for n, name in enumerate(names, 1) if any(word in (name or "").lower() for word in _DEVIATIONS)]
+    if is_change(path):
+        raise SatIntervalsError(f"{path} is a change of height: give surfaces")
+    bands = [
+        n for n, name in enumerate(names, 1) if n > 1 and any(word in (name or "").lower() for word in _DEVIATIONS)
+    ]
     if sigma is None and not bands:
         raise SatIntervalsError(
             f"{path} has neither bounds nor a band named sigma: give --sigma, the standard deviation of its heights"

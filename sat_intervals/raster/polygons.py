@@ -7,6 +7,8 @@ import numpy as np
 from rasterio.features import rasterize, shapes
 from rasterio.warp import transform_geom
 
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 
 Polygon = Mapping[str, Any]
@@ -21,5 +23,10 @@ def outline(inside: np.ndarray, place: Georeferencing) -> Polygon:
 
 def burned(polygons: Sequence[Polygon], crs: str, place: Georeferencing, shape: tuple[int, int]) -> np.ndarray:
     """Return which cells have their centre in one of some polygons of a CRS."""
-    moved = transform_geom(crs, place.crs, polygons)
+    try:
+        moved = transform_geom(crs, place.crs, polygons)
+    except gdal.GDAL_ERRORS as error:
+        raise SatIntervalsError(
+            f"polygons of {crs[:40]} are not on the map of the surface: {gdal.reason(error)}"
+        ) from error
     return np.asarray(rasterize(moved, shape, transform=place.affine, dtype=np.uint8)) > 0

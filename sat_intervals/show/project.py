@@ -138,7 +138,7 @@ def _change(out: Path) -> Iterator[ProjectLayer]:
         (4, "significance", styles.shares(4)),
         (1, "difference", styles.diverging(1, end, unit="m")),
     ):
-        yield ProjectLayer("Change", name, names[name], raster, renderer, number == 1, number != 4)
+        yield ProjectLayer("Change", name, names[name], raster, renderer, number == 1, number == 5)
 
 
 def _images(run: Run) -> Iterator[ProjectLayer]:

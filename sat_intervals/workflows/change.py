@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.evaluate.accuracy import LARGEST
 from sat_intervals.evaluate.change import open_pair
 from sat_intervals.evaluate.change_areas import Areas, signs_of, stable_ground
 from sat_intervals.heights.polygons import write_polygons
@@ -82,6 +83,10 @@ def change(
     given = [one.path, other.path, *([stable] if stable else [])]
     check_not_replaced(given, [out / name for name in FILES])
     signs, counts = signs_of(pair, false_alarms, stable_ground(stable, pair))
+    if stable and not counts["stable"]:
+        raise SatIntervalsError(
+            f"{stable} has no ground that both surfaces have: give polygons or a raster of the place"
+        )
     areas = Areas(pair, signs, smallest_area)
     tags = {
         "SOFTWARE": "sat-intervals", "BEFORE": str(one.path), "AFTER": str(other.path), "COVERAGE": f"{one.coverage:g}",
@@ -93,13 +98,18 @@ def change(
             writer.write(window.row, areas.add(window))
             progress("change", window.row_stop, one.shape[0])
         writer.publish()
+    figures = areas.figures()
     if find_spec("pyogrio") and find_spec("shapely"):
-        write_polygons(out / FILES[1], list(areas.outlines()), areas.figures(), one.place)
+        write_polygons(out / FILES[1], list(areas.outlines()), figures, one.place)
     else:
+        (out / FILES[1]).unlink(missing_ok=True)  # never beside files of another change
         warnings.append(f"{FILES[1]} is not written: it needs pip install 'sat-intervals[reference]'")
     measured = counts["false"] / counts["stable"] if counts["stable"] else None
     rate = {"named": false_alarms, "measured": measured, "stable": counts["stable"], "median": pair.median}
-    found, compared = areas.report(), {"compared": counts["compared"], "undecided": signs.size - counts["compared"]}
+    found, compared = (
+        areas.report(figures),
+        {"compared": counts["compared"], "undecided": signs.size - counts["compared"]},
+    )
     report: dict[str, Any] = plain({
         "software": "sat-intervals", "before": one.path, "after": other.path, "smallest_area": smallest_area,
         "coverage": one.coverage, "cell": one.place.pixel_size[0], "registration": pair.registration, "rate": rate,
@@ -114,9 +124,10 @@ def _check(false_alarms: float, smallest_area: float, sigma: float | None) -> No
     """Raise for numbers that have no meaning."""
     if not 0 < false_alarms < 1:
         raise SatIntervalsError(f"false_alarms is {false_alarms:g}: give a share between 0 and 1, such as 0.01")
-    for name, value in {"smallest_area": smallest_area, "sigma": sigma}.items():
-        if value is not None and not 0 <= value < float("inf"):
-            raise SatIntervalsError(f"{name} is {value:g}: give a number that is not negative")
+    if not 0 <= smallest_area < float("inf"):
+        raise SatIntervalsError(f"smallest_area is {smallest_area:g}: give a number that is not negative")
+    if sigma is not None and not 0 < sigma < LARGEST:
+        raise SatIntervalsError(f"sigma is {sigma:g} m: give one above 0, up to {LARGEST:g}")
 
 
 def _rate_warnings(rate: dict[str, Any], scale: float) -> list[str]:

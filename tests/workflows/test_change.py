@@ -1,6 +1,7 @@
 """Change between two dates: surfaces with known changes, errors within their intervals, and a shift."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from rasterio.transform import Affine
 from surfaces import PLACE, write_raster, write_surface
 
 import sat_intervals
+from sat_intervals.evaluate.change import open_pair
+from sat_intervals.evaluate.change_areas import Areas, signs_of, stable_ground
 from sat_intervals.kernels import registration
 from sat_intervals.products import SURFACE
 
@@ -141,6 +144,51 @@ def test_change__takes_surfaces_of_other_tools(dates, tmp_path):
     assert (again["areas"], again["cells"]["undecided"]) == (0, 40)
 
 
+def test_change__of_no_smallest_area_keeps_the_rate(tmp_path):
+    for seed in (1, 2):
+        write_date(tmp_path / f"{seed}.tif", seed)
+    found = sat_intervals.change(
+        tmp_path / "1.tif", tmp_path / "2.tif", tmp_path / "out", registers=False, smallest_area=0
+    )
+    assert found["cells"]["risen"] + found["cells"]["fallen"] < 0.02 * SIDE**2
+
+
+def test_change__counts_no_ground_and_unknown_sigma_as_no_data(tmp_path):
+    write_date(tmp_path / "one.tif", 1)
+    with rasterio.open(tmp_path / "one.tif") as source:
+        height = source.read(1)
+    place = {"height": SIDE, "width": SIDE, "crs": "EPSG:32631", "transform": PLACE}
+    with rasterio.open(tmp_path / "two.tif", "w", driver="GTiff", count=2, dtype="float32", **place) as dataset:
+        height[:3], sigma = -32768, np.full((SIDE, SIDE), 4, np.float32)
+        sigma[5:7] = -9999
+        dataset.write(np.stack([np.nan_to_num(height, nan=-32768), sigma]))
+        dataset.scales = [1, 0.1]
+        dataset.descriptions = ["dsm", "dsm_std"]
+    found = sat_intervals.change(tmp_path / "one.tif", tmp_path / "two.tif", tmp_path / "out", registers=False)
+    assert (found["areas"], found["cells"]["undecided"]) == (0, 40 + 5 * SIDE)
+
+
+def test_areas__volumes_have_the_error_of_the_shift_on_slopes(tmp_path):
+    ramp = 0.5 * np.indices((80, 80))[1].astype(float)
+    for name, rise in (("before", 0), ("after", 9)):
+        height = ramp.copy()
+        height[20:60, 20:60] += rise
+        write_surface(tmp_path / f"{name}.tif", height, height - HALF, height + HALF, TAGS)
+    pair, _ = open_pair(tmp_path / "before.tif", tmp_path / "after.tif", None, registers=False)
+    found = {}
+    for deviation in (0.0, 0.25):
+        moved = replace(pair, registration={"shift": (0, 0, 0), "deviation": (deviation, deviation, 0.0)})
+        signs, _ = signs_of(moved, 0.01, stable_ground(None, moved))
+        areas = Areas(moved, signs, 50)
+        for window in moved.strips():
+            areas.add(window)
+        figures = areas.figures()
+        found[deviation] = float(figures["volume_deviation"][0] / figures["area"][0])
+        total = areas.report(figures)["volume"]["gained"][1]
+        assert total == pytest.approx(float(figures["volume_deviation"][0]), rel=1e-6)
+    assert found[0.25] > 0.12 > 3 * found[0.0]
+
+
 def test_change__warns_of_intervals_that_are_too_narrow(tmp_path):
     for seed in (1, 2):
         bands = [ground(*np.indices((64, 64))) + np.random.default_rng(seed).normal(size=(64, 64))]
@@ -165,6 +213,12 @@ def test_change__refuses_in_one_line(dates, changed, tmp_path):
     refused(["change", before, far, tmp_path], "same place")
     other_side = write_date(tmp_path / "side.tif", 1, crs="EPSG:32731")
     refused(["change", before, other_side, tmp_path, "--no-register"], "same place")
+    feet = write_date(tmp_path / "feet.tif", 1, crs="EPSG:2236")
+    refused(["change", before, feet, tmp_path], "feet.tif is on no map in metres")
+    refused(["change", before, after, tmp_path, "--sigma", 1], "both surfaces have bounds: leave sigma out")
+    refused(["change", before, dates / "out" / "change.tif", tmp_path], "is a change of height: give surfaces")
+    elsewhere = write_raster(tmp_path / "elsewhere.tif", np.ones((1, 9, 9)), PLACE @ Affine.translation(9000, 0))
+    refused(["change", before, after, tmp_path / "new", "--stable", elsewhere], "elsewhere.tif has no ground that both")
 
 
 @pytest.mark.peer("matplotlib")

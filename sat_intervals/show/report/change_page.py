@@ -16,7 +16,7 @@ def write_change_page(out: Path, report: dict[str, Any], lines: list[str]) -> Pa
     """Write the page of a folder of `change`: files, lines, and the map if `plot` has drawn it; return its path."""
     picture = out / "change.png"
     shown = "<p>sat-intervals plot draws the map: then make this page again.</p>"
-    if picture.exists():
+    if picture.exists() and picture.stat().st_mtime >= (out / "change.json").stat().st_mtime:
         shown = f'<img alt="map" src="data:image/png;base64,{base64.b64encode(picture.read_bytes()).decode()}">'
     told = [f"{report['before']} to {report['after']}", *lines, *report["warnings"]]
     page = "".join([_HEAD, *(f"<p>{escape(line)}</p>\n" for line in told), shown, "</html>\n"])
