@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 # Share of cells whose runs disagree above which it warns: of pairs of one year 1 to 3 %, not aligned 40 %.
 _DISAGREEING = 0.1
+# Metres of height that two datums may differ by.
+_OTHER_DATUM = 10.0
 _GRID_OPTIONS = (
     click.option("--resolution", type=float, metavar="METRES", help="Side of a cell; or give --grid-like."),
     click.option("--grid-like", type=options.FILE, help="North-up raster whose grid and CRS the surface takes."),
@@ -135,6 +137,8 @@ def say_surface(console: "Console", report: dict[str, Any]) -> None:
             )
         )
         console.say(f"{found['run']} moved: {shift}")
+        if abs(up := found["shift"][2]) > _OTHER_DATUM:
+            warn([f"{found['run']} moved by {up:.0f} m in height, as if of another datum: check what heights refer to"])
     if (share := report["disagreeing"]) is not None:
         console.say(f"where runs overlap, {100 * share:.1f} % of the cells disagree")
         if share > _DISAGREEING:

@@ -17,7 +17,7 @@ _MAKE_ONE = "make one with sat-intervals calibrate --dsm"
 # Tags of a surface that its intervals depend on.
 _OF_INTERVALS = (
     "COVERAGE", "ALPHA", "DISPARITY_CALIBRATION", "INTERVAL", "IMAGES",
-    "RADIUS", "OUTLIERS", "OPEN_POINTS", "MIN_CONFIDENCE",
+    "ALIGNED", "RADIUS", "OUTLIERS", "OPEN_POINTS", "MIN_CONFIDENCE",
 )  # fmt: skip
 _LARGEST = 10_000.0  # metres
 

@@ -5,7 +5,7 @@ blocks of ground that both have; least squares over all these shifts give one of
 """
 
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import combinations
@@ -14,16 +14,19 @@ from typing import Any
 
 import numpy as np
 
+from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.point_cloud import Cells, PointCloud
 from sat_intervals.kernels.gridding import mean_heights
-from sat_intervals.kernels.registration import REACH, every_nth, put_together, register, spread_blocks
-from sat_intervals.raster import north_up, read_heights
+from sat_intervals.kernels.registration import REACH, Registration, every_nth, put_together, register, spread_blocks
+from sat_intervals.raster import is_ground, north_up, read_heights
 from sat_intervals.tiling import Window
 
 # Smallest side of the blocks that register, in cells.
 _SMALLEST = 16
 # What pulls the mean of all shifts to 0, or the reference, in inverse metres.
 _HELD = 1e3
+# Metres: least deviation of a shift, and heights that differ by more are of other units.
+_LEAST, _FAR = 0.01, 500.0
 
 
 def aligned(
@@ -37,6 +40,7 @@ def aligned(
     """Move the points of runs onto each other, or onto a raster of reference heights.
 
     Also return the shift of each run, easting, northing and height in metres, with its ``deviation``, None if unknown.
+    Raises `SatIntervalsError` for a run that has no ground with the reference, or is far from it.
     """
     count = len(clouds) + bool(reference)
     heights_only = [PointCloud(one.run, one.ground.lattice, replace(one.choices, bounds="envelope")) for one in clouds]
@@ -49,7 +53,9 @@ def aligned(
                 found.setdefault((one, other), []).append(part)
     pairs = {pair: register(put_together(parts, cells.resolution, moves=-1)) for pair, parts in found.items()}
     known = {pair: one for pair, one in pairs.items() if one}
-    shifts, deviations = _solved(known, count, has_reference=bool(reference))
+    shifts, deviations = solved(known, count, has_reference=bool(reference))
+    if reference:
+        _check(clouds, shifts, deviations, reference)
     moved, report = [], []
     for cloud, shift, deviation in zip(clouds, shifts, deviations, strict=False):
         lattice = cloud.ground.lattice
@@ -70,7 +76,8 @@ def _heights(
     if reference:
         place = north_up(crs, cells.left, cells.top, cells.resolution).shifted(around)
         shape = around.height, around.width
-        yield read_heights(reference, place, shape, Window(0, 0, *shape), smooth=True).astype(np.float32)
+        heights = read_heights(reference, place, shape, Window(0, 0, *shape), smooth=True)
+        yield np.where(is_ground(heights), heights, np.nan).astype(np.float32)
 
 
 def _part(surface: np.ndarray, heights: np.ndarray) -> tuple[np.ndarray, ...] | None:
@@ -83,18 +90,39 @@ def _part(surface: np.ndarray, heights: np.ndarray) -> tuple[np.ndarray, ...] | 
     return surface, column.astype(float), row.astype(float), heights[row, column]
 
 
-def _solved(pairs: dict[tuple[int, int], Any], count: int, *, has_reference: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return shifts and deviations, ``(count, 3)``, by weighted least squares over the shifts of pairs."""
+def solved(
+    pairs: Mapping[tuple[int, int], Registration], count: int, *, has_reference: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return shifts and deviations, ``(count, 3)``, by weighted least squares over the shifts of pairs.
+
+    Deviations are NaN of runs that no pairs link to the reference, which is the last one, or to all others.
+    """
     shifts, deviations = np.zeros((count, 3)), np.full((count, 3), np.nan)
     for axis in range(3):
         known = {pair: one for pair, one in pairs.items() if np.isfinite(one.deviation[axis])}
         rows, values = np.zeros((len(known) + 1, count)), np.zeros(len(known) + 1)
         for row, ((one, other), found) in enumerate(known.items()):
-            weight = 1 / found.deviation[axis]
+            weight = 1 / max(found.deviation[axis], _LEAST)
             rows[row, [one, other]], values[row] = (-weight, weight), weight * found.shift[axis]
         rows[-1, -1 if has_reference else slice(None)] = _HELD
         inverse = np.linalg.pinv(rows)
-        met = np.unique([number for pair in known for number in pair]).astype(int)
         shifts[:, axis] = inverse @ values
-        deviations[met, axis] = np.sqrt(np.square(inverse).sum(axis=1))[met]
+        linked = {count - 1}
+        for _ in range(count):
+            linked |= {end for pair in known if linked & {*pair} for end in pair}
+        if has_reference or len(linked) == count:
+            met = sorted(linked)
+            deviations[met, axis] = np.sqrt(np.square(inverse).sum(axis=1))[met]
     return shifts, deviations
+
+
+def _check(clouds: Sequence[PointCloud], shifts: np.ndarray, deviations: np.ndarray, reference: Path) -> None:
+    """Raise for a run whose height is not known from the reference, or is far from it."""
+    for cloud, (*_, up), (*_, deviation) in zip(clouds, shifts, deviations, strict=False):
+        if np.isnan(deviation):
+            raise SatIntervalsError(f"{cloud.run.out} has no ground with {reference}: give a reference of this place")
+        if abs(up) > _FAR:
+            raise SatIntervalsError(
+                f"{cloud.run.out} and {reference} differ by {up:.0f} m in height: check that both are metres above the "
+                "same datum"
+            )

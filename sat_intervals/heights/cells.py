@@ -132,6 +132,9 @@ def fused(gathered: Sequence[np.ndarray], apart: float) -> np.ndarray:
         middle, half = _mean(width**-2, (lowers + uppers) / 2), _mean(width**-2, width**2) ** 0.5 / 2
         lower = np.where(several & meeting, middle - half, np.fmin.reduce(lowers))
         upper = np.where(several & meeting, middle + half, np.fmax.reduce(uppers))
+        lower, upper = (
+            np.where(differ, end(bound, height), bound) for end, bound in ((np.fmin, lower), (np.fmax, upper))
+        )
     bands = {
         "height": np.fmin(np.fmax(height, lower), upper),
         "height_lower": outwards(lower, -np.inf),
@@ -148,7 +151,7 @@ def _low(weights: np.ndarray, values: np.ndarray) -> np.ndarray:
     weights = np.where(np.isfinite(values + weights), weights, 0.0)
     order = np.where(weights > 0, values, np.inf).argsort(axis=0)
     upto = np.take_along_axis(weights, order, axis=0).cumsum(axis=0)
-    first = (upto >= _LOW * upto[-1]).argmax(axis=0)[np.newaxis]
+    first = (upto >= _LOW * (1 - 1e-9) * upto[-1]).argmax(axis=0)[np.newaxis]
     return np.asarray(np.take_along_axis(values, np.take_along_axis(order, first, axis=0), axis=0)[0])
 
 

@@ -49,6 +49,8 @@ class SurfaceChoices:
     def __post_init__(self) -> None:
         if self.bounds is not None and self.bounds not in BOUNDS:
             raise SatIntervalsError(f"bounds is {self.bounds!r}, allowed: {', '.join(BOUNDS)}")
+        if self.reference and not self.aligns:
+            raise SatIntervalsError("runs are moved onto a reference: leave it out, or let them be aligned")
         for name, value in (("outliers", self.outliers), ("max_width", self.max_width)):
             if value is not None and not 0 < value < float("inf"):
                 raise SatIntervalsError(f"{name} is {value:g} m: give one above 0, or leave it out")

@@ -19,6 +19,8 @@ from sat_intervals.machine import usable_cores
 from sat_intervals.progress import Progress
 from sat_intervals.raster import OutputWriter, Projection, files_of, north_up, read_place, surface_file, utm_of
 from sat_intervals.raster.georeferencing import horizontal_name
+from sat_intervals.raster.heightfield import warn_of_no_data
+from sat_intervals.raster.surfaces import check_level
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
 
@@ -79,14 +81,16 @@ def make_surface(
     """
     path, geoid = Path(path), None if geoid is None else Path(geoid)
     choices = choices or SurfaceChoices()
-    given = [geoid, choices.reference, *_files_of(resolution)]
+    given = [geoid, *_files_of(choices.reference), *_files_of(resolution)]
     grid, resolution, crs, radius = checked_cells(resolution, crs, radius, geoid)
+    level = f"above {geoid or 'the WGS 84 ellipsoid'}"
+    _check_reference(choices.reference, path, level)
     geometries = _geometries(outs, path, given, progress)
     runs = [geometry.run for geometry in geometries]
     intervals = [run.config.interval for run in runs]
     choices = choices.for_intervals(intervals)
     tags = surface_tags([run.report["finished"] for run in runs], intervals, choices, resolution, radius)
-    tags["HEIGHTS"] = f"above {geoid or 'the WGS 84 ellipsoid'}"
+    tags["HEIGHTS"] = level
     middle = geometries[0].lattice.middle
     projection = Projection(crs or utm_of(*middle), geoid)
     projection.check(*middle)
@@ -111,9 +115,17 @@ def make_surface(
     }
 
 
-def _files_of(resolution: float | Path) -> Sequence[str]:
-    """Return the files of the raster whose grid is taken, if there is one."""
-    return files_of(str(resolution)) if isinstance(resolution, Path) and resolution.exists() else ()
+def _check_reference(reference: Path | None, surface: Path, level: str) -> None:
+    """Raise for a raster that is no reference of a surface above ``level``; warn of one without no data."""
+    if reference:
+        read_place(reference)
+        check_level(reference, str(surface), level)
+        warn_of_no_data(reference)
+
+
+def _files_of(raster: float | Path | None) -> Sequence[str]:
+    """Return the files of a raster, if there is one."""
+    return files_of(str(raster)) if isinstance(raster, Path) and raster.exists() else ()
 
 
 def _write(
@@ -190,6 +202,8 @@ def surface_tags(
     """Return tags: when runs finished, how intervals are made, their coverage; ``cell`` and ``radius`` are metres."""
     levels = {("COVERAGE", one.coverage) if one.coverage else ("ALPHA", one.alpha) for one in intervals if one}
     tags = {"RUNS": " ".join(runs), **choices.tags(), "RADIUS": f"{radius:g} m"}
+    if choices.reference or len(runs) > 1:
+        tags["ALIGNED"] = f"to {choices.reference}" if choices.reference else "yes" if choices.aligns else "no"
     tags |= {name: str(level) for name, level in levels} if len(levels) == 1 else {}
     matched = [one.calibration for one in intervals if one and isinstance(one.calibration, Calibration)]
     if matched:

@@ -49,10 +49,15 @@ def read_place(path: Path) -> tuple[tuple[int, int], Georeferencing]:
 
 def check_reference(path: Path, surface: Path) -> None:
     """Raise if reference heights have a local CRS, another unit, or another vertical datum than a surface model."""
-    with opened(str(path)) as dataset:
-        crs, unit = pyproj.CRS.from_wkt(dataset.crs.to_wkt()), other_unit(dataset)
     with opened(str(surface)) as dataset:
         level = dataset.tags().get("HEIGHTS", "")
+    check_level(path, str(surface), level)
+
+
+def check_level(path: Path, surface: str, level: str) -> None:
+    """Do the same of a surface whose heights are above ``level``, in words."""
+    with opened(str(path)) as dataset:
+        crs, unit = pyproj.CRS.from_wkt(dataset.crs.to_wkt()), other_unit(dataset)
     parts = crs.sub_crs_list if crs.is_compound else [crs]
     if not (parts[0].is_geographic or parts[0].is_projected):
         raise SatIntervalsError(f"the CRS of {path}, {crs.name}, is a local one: give a reference on the Earth")

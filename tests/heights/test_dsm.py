@@ -19,10 +19,12 @@ from surfaces import write_geoid, write_raster
 
 from sat_intervals import SatIntervalsError
 from sat_intervals.config import load_calibration, load_height_calibration
+from sat_intervals.heights.alignment import solved
 from sat_intervals.heights.choices import BOUNDS, SurfaceChoices
 from sat_intervals.heights.dsm import make_surface
 from sat_intervals.heights.geometry import Geometry
 from sat_intervals.heights.lattice import Lattice
+from sat_intervals.kernels.registration import Registration
 from sat_intervals.products import OPEN_ABOVE, RANGE_INCOMPLETE, SURFACE
 from sat_intervals.raster import Projection, north_up, utm_of, write_layer
 from sat_intervals.raster.projection import transformed
@@ -198,6 +200,55 @@ def test_make_surface__of_runs_that_are_apart_has_the_height_with_a_third_of_the
     assert report["shifts"] == []
 
 
+def test_make_surface__of_heights_apart_whose_intervals_meet_contains_the_one_that_is_taken(tmp_path):
+    # 2 to 18 around 10, and 16 to 24 around 20: the low one has 1/16 of 3/16 of the weights, a third.
+    one = write_points(tmp_path / "a", [0.5], [-0.5], [10.0], lower=8, upper=8)
+    two = write_points(tmp_path / "b", [0.5], [-0.5], [20.0], lower=4, upper=4)
+    surface, place, _ = surface_of([one, two], tmp_path, radius=0.6)
+    i, j = cell_of(place, LEFT, TOP)
+    middle, half = (10 / 16**2 + 20 / 8**2) / (1 / 16**2 + 1 / 8**2), (2 / (1 / 16**2 + 1 / 8**2)) ** 0.5 / 2
+    assert_allclose(surface[:3, i, j], [10, min(10, middle - half), middle + half], atol=1e-4)
+
+
+def registration(shift, deviation):
+    return Registration(np.array(shift), np.array(deviation), True, 99, np.zeros(1), np.zeros(1))
+
+
+def test_solved__shifts_of_a_chain_and_what_is_not_linked():
+    step = registration([1.0, 0, 2], [0.1, np.nan, 0.0])
+    shifts, deviations = solved({(0, 1): step, (1, 2): step}, 3, has_reference=False)
+    assert_allclose(shifts, [[-1, 0, -2], [0, 0, 0], [1, 0, 2]], atol=1e-6)
+    assert np.isfinite(deviations[:, [0, 2]]).all()
+    assert np.isnan(deviations[:, 1]).all()
+    shifts, deviations = solved({(0, 1): step, (1, 2): step}, 3, has_reference=True)
+    assert_allclose(shifts, [[-2, 0, -4], [-1, 0, -2], [0, 0, 0]], atol=1e-6)
+    apart = {(0, 1): step, (2, 3): step}
+    shifts, deviations = solved(apart, 4, has_reference=False)
+    assert_allclose(shifts[:, 0], [-0.5, 0.5, -0.5, 0.5], atol=1e-6)
+    assert np.isnan(deviations).all()  # nobody knows how far the two are from the others
+    assert np.isfinite(solved(apart, 4, has_reference=True)[1][:, 0]).tolist() == [False, False, True, True]
+
+
+def test_make_surface__refuses_a_reference_that_says_nothing(tmp_path):
+    x, y = np.meshgrid(np.arange(0.5, 40), -np.arange(0.5, 40))
+    out = write_points(tmp_path / "a", x, y, 500 + 3 * np.sin(0.3 * x) + 2 * np.cos(0.4 * y))
+    _, place, _ = surface_of([out], tmp_path)
+
+    def reference(name, heights, left=place.c, crs="EPSG:32631"):
+        write_layer(tmp_path / name, heights, np.nan, north_up(crs, left, place.f, 1.0))
+        return SurfaceChoices(reference=tmp_path / name)
+
+    for choices, message in (
+        (reference("elsewhere.tif", np.full((40, 40), 500.0), left=place.c + 9000), "has no ground with .*elsewhere"),
+        (reference("feet.tif", np.full((60, 60), 1640.0)), "differ by 114. m in height: check that both are metres"),
+        (SurfaceChoices(reference=tmp_path / "none.tif"), "none.tif"),
+    ):
+        with pytest.raises(SatIntervalsError, match=message):
+            surface_of([out], tmp_path / "new", choices=choices)
+    with pytest.raises(SatIntervalsError, match="runs are moved onto a reference"):
+        SurfaceChoices(aligns=False, reference=tmp_path / "feet.tif")
+
+
 def test_make_surface__moves_runs_onto_each_other_or_a_reference(tmp_path):
     x, y = np.meshgrid(np.arange(0.5, 90, 0.5), -np.arange(0.5, 80, 0.5))
 
@@ -221,6 +272,8 @@ def test_make_surface__moves_runs_onto_each_other_or_a_reference(tmp_path):
     _, _, plain = surface_of(runs, tmp_path, radius=0.8, choices=SurfaceChoices(aligns=False))
     assert plain["shifts"] == []
     assert plain["disagreeing"] > 0.02
+    with rasterio.open(tmp_path / "dsm.tif") as dataset:
+        assert dataset.tags()["ALIGNED"] == "no"
     row, column = np.indices(surface.shape[1:]) + 0.5
     heights = ground(place.c + column - LEFT, place.f - row - TOP) + 3
     write_layer(tmp_path / "reference.tif", heights, np.nan, north_up("EPSG:32631", place.c, place.f, 1.0))
