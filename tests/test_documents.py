@@ -224,7 +224,7 @@ def test_code__of_all_documents_runs(place: Path, monkeypatch: pytest.MonkeyPatc
             if "lidar.tif" in code or "later/" in code:
                 assert invoke("dsm", "out", "--resolution", 1, *shlex.split(in_documents(SENSORS))).exit_code == 0
                 _write_lidar(place)
-                shutil.copytree(place / "out", place / "later")
+                shutil.copytree(place / "out", place / "later", dirs_exist_ok=True)
             code = code.replace('.surface(["left.tif", "right.tif"]', '.surface(["raw/left.tif", "raw/right.tif"]')
             code = GIVEN + code.replace("profile(640)", "profile(64)")
             done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)

@@ -4,6 +4,7 @@ import json
 import shutil
 import signal
 import subprocess
+import time
 from itertools import count
 
 import numpy as np
@@ -483,6 +484,7 @@ def test_dsm__ends_within_seconds_of_an_interrupt(tmp_path):
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         try:
             wait_until(lambda: list(tmp_path.glob(".*")), "a temporary file")
+            time.sleep(0.5)  # it is there an instant before it would be removed
             process.send_signal(signal.SIGINT)
             said = process.communicate(timeout=20)[1]
         finally:

@@ -445,7 +445,7 @@ def test_shifted__moves_transform_points_and_rpcs(tmp_path):
 
 # Outputs
 
-HEIGHT, WIDTH = 560, 70  # enough for an overview
+HEIGHT, WIDTH = 560, 520  # enough for an overview
 
 
 @pytest.fixture(scope="module")
