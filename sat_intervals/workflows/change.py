@@ -106,10 +106,8 @@ def change(
         warnings.append(f"{FILES[1]} is not written: it needs pip install 'sat-intervals[reference]'")
     measured = counts["false"] / counts["stable"] if counts["stable"] else None
     rate = {"named": false_alarms, "measured": measured, "stable": counts["stable"], "median": pair.median}
-    found, compared = (
-        areas.report(figures),
-        {"compared": counts["compared"], "undecided": signs.size - counts["compared"]},
-    )
+    found = areas.report(figures)
+    compared = {"compared": counts["compared"], "undecided": signs.size - counts["compared"]}
     report: dict[str, Any] = plain({
         "software": "sat-intervals", "before": one.path, "after": other.path, "smallest_area": smallest_area,
         "coverage": one.coverage, "cell": one.place.pixel_size[0], "registration": pair.registration, "rate": rate,

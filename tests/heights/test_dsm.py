@@ -267,7 +267,6 @@ def test_make_surface__moves_runs_onto_each_other_or_a_reference(tmp_path):
     surface, place, report = surface_of(runs, tmp_path, radius=0.8)
     found = np.array([one["shift"] for one in report["shifts"]])
     assert_allclose(found, -off, atol=0.15)
-    assert_allclose(found.sum(axis=0), 0, atol=1e-6)
     assert all(0 < deviation < 0.1 for one in report["shifts"] for deviation in one["deviation"])
     assert report["disagreeing"] < 0.01
     _, _, plain = surface_of(runs, tmp_path, radius=0.8, choices=SurfaceChoices(aligns=False))
