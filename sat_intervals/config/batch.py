@@ -25,17 +25,18 @@ _RESERVED = (REPORT, "logs")
 _LONGEST_NAME = 200
 _SENSORS = ("left_model", "right_model", "left_grid", "right_grid")
 _COLUMNS = ("name", "left", "right", "images", "minimum", "maximum", "window", "resolution")
-_PATHS = ("left_mask", "right_mask", *_SENSORS, "geoid", "dem")
+_PATHS = ("left_mask", "right_mask", *_SENSORS, "geoid", "dem", "height_calibration")
 # Numbers, or text with them.
 _SPLIT = BeforeValidator(lambda value: value.split() if isinstance(value, str) else value)
 _WINDOW = Annotated[tuple[int, int, int, int], _SPLIT]
+_EXTENT = Annotated[tuple[float, float, float, float], _SPLIT]
 # Columns that only some rows have.
 _ONLY_OF = {
     "two images": (
         *("window", "minimum", "maximum", "radius", "dem", "altitude", "resolution_of", *_PATHS[:6]),
         *("left_nodata", "right_nodata", "left_band", "right_band"),
     ),
-    "three images or more": ("heights", "ortho"),
+    "three images or more": ("extent", "heights", "ortho"),
 }
 
 
@@ -59,6 +60,8 @@ class SurfaceOptions(TypedDict, total=False):
     dem: Path
     altitude: float
     resolution_of: str
+    height_calibration: Path
+    extent: _EXTENT
     heights: Annotated[tuple[float, float], _SPLIT]
     ortho: bool
 

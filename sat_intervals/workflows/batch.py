@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sat_intervals.config import Config, load_config, named_files, read_yaml
+from sat_intervals.config import Config, load_config, load_height_calibration, named_files, read_yaml, resolved
 from sat_intervals.config.batch import REPORT, PairOfBatch
 from sat_intervals.config.presets import merged
 from sat_intervals.errors import RunError, SatIntervalsError
@@ -118,7 +118,7 @@ def _check_not_replaced(pairs: Sequence[PairOfBatch], others: Sequence[str | Pat
     """Raise if an input of any pair, or another file that is read, is an output of any pair."""
     folders = [out / pair.name for pair in pairs]
     images = [name for pair in pairs for name in (*pair.images, pair.left_mask, pair.right_mask)]
-    files = [pair.options.get(name) for pair in pairs for name in ("geoid", "dem")]
+    files = [pair.options.get(name) for pair in pairs for name in ("geoid", "dem", "height_calibration")]
     named = [name for pair in pairs for name in (*(pair.sensors or ()), *named_files(pair.settings))]
     names = {str(name) for name in (*others, *images, *named, *files) if name}
     read = [file for name in names for file in _files(name)]
@@ -160,10 +160,13 @@ class _Surfaces:
         """Return what is to be matched of a row; None of more images whose surface is there."""
         out, overwrite = self._out / pair.name, self._how["overwrite"]
         if not pair.more:
+            if pair.resolution and (choices := _choices(pair)).calibration:
+                check_cells(_cells(pair), choices, resolved(settings).interval)
             images, how = self._epipolar(pair, out), {"overwrite": overwrite, "pair": pair.name, "each": each}
             return open_job(*images, out, settings, window=_window(pair), **how)
         options: dict[str, Any] = {**pair.options}  # those of pairs are not there
-        wanted = Wanted(pair.resolution or 0.0, **options)
+        options.pop("height_calibration", None)
+        wanted = Wanted(pair.resolution or 0.0, **options, calibration=_choices(pair).calibration)
         asked = asked_of(_opened(pair), out, settings, wanted, overwrite=overwrite)
         if not overwrite and complete_sweep(asked, out, keep_tiles=keep_tiles):
             return None
@@ -192,7 +195,7 @@ class _Surfaces:
                 raise self._errors[pair.name]
             out, progress = self._out / pair.name, self._how["progress"]
             if not pair.more:
-                return {"surface": surface_of(out, self._sensors[pair.name], progress, **_cells(pair))}
+                return {"surface": surface_of(out, self._sensors[pair.name], progress, **_cells(pair), choices=_choices(pair))}
             if pair.name in self._orthos:
                 from sat_intervals.workflows.ortho import write_ortho
 
@@ -204,6 +207,11 @@ class _Surfaces:
 
 def _cells(pair: PairOfBatch) -> dict[str, Any]:
     return {"resolution": pair.resolution} | {name: pair.options.get(name) for name in ("crs", "radius", "geoid")}
+
+
+def _choices(pair: PairOfBatch) -> SurfaceChoices:
+    file = pair.options.get("height_calibration")
+    return SurfaceChoices(calibration=load_height_calibration(file) if file else None)
 
 
 def _opened(pair: PairOfBatch) -> list[Image]:

@@ -114,6 +114,18 @@ def test_surface_of_many__covers_an_extent_and_moves_bounds_by_margins(sweep, tm
     assert half == pytest.approx(np.nanmedian(after[2] - after[1]) / 2, abs=0.02)
     with rasterio.open(tmp_path / "calibrated" / "dsm.tif") as dataset:
         assert dataset.tags()["CALIBRATION"] == f"heights {calibration.sha256}"
+    common = {"resolution": PIXEL, "crs": CRS, "height_calibration": str(margins)}
+    names = [str(image) for image in sweep.images]
+    rows = [
+        {"name": "many", "images": names, "extent": " ".join(map(str, extent))} | common,
+        {"name": "two", "images": names[:2], "altitude": 20} | common,
+    ]
+    (tmp_path / "rows.json").write_text(json.dumps(rows))
+    assert invoke("batch", tmp_path / "rows.json", tmp_path / "batch").exit_code == 1
+    states = json.loads((tmp_path / "batch" / "batch.json").read_text())
+    assert states["many"]["state"] == "done"
+    assert "belongs to other surfaces" in states["two"]["error"]
+    np.testing.assert_array_equal(read_layers(tmp_path / "batch" / "many" / "dsm.tif"), after)
     refused((*command, "--resolution", 2 * PIXEL), "belongs to other surfaces, CELL is")
     refused((*command[:-2], "--extent", 9, 0, 1, 5), "extent is 9 0 1 5: give left")
 
