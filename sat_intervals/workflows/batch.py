@@ -195,7 +195,8 @@ class _Surfaces:
                 raise self._errors[pair.name]
             out, progress = self._out / pair.name, self._how["progress"]
             if not pair.more:
-                return {"surface": surface_of(out, self._sensors[pair.name], progress, **_cells(pair), choices=_choices(pair))}
+                cells = _cells(pair) | {"choices": _choices(pair)}
+                return {"surface": surface_of(out, self._sensors[pair.name], progress, **cells)}
             if pair.name in self._orthos:
                 from sat_intervals.workflows.ortho import write_ortho
 
