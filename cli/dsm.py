@@ -171,7 +171,7 @@ def dsm(
     sensor_files: list[options.SensorFiles],
     printing: options.Printing,
 ) -> None:
-    """Make a surface model from the finished runs in the folders OUT.
+    """Make a surface model from the finished runs in the folders OUT, or of the pairs of a batch.
 
     Models are GeoTIFF or NITF with RPC tags, .RPB, _RPC.TXT, .geom or DIMAP XML files. Grids contain the sensor column
     and row (bands 1 and 2) of epipolar positions, as written by CARS and shareloc, or displacements to them, if OTB's
@@ -189,8 +189,10 @@ def dsm(
     hull.
     """
     from sat_intervals.heights.dsm import make_surface
+    from sat_intervals.run.status import runs_of
 
     output = options.output_file(output, outs[0] / "dsm.tif", overwrite=overwrite)
+    outs = tuple(run for out in outs for run in runs_of(out))
     cells["choices"] = replace(cells["choices"], aligns=aligns, reference=reference)
     with printing.console() as console:
         options.note_geometry(outs, sensor_files)

@@ -22,9 +22,12 @@ def project(out: Path) -> None:
                               significance
     OUT/*.qml                 style of the raster of the same name
 
-    QGIS 3.22 or newer opens it. Files of these names are replaced: save changes in QGIS under another name.
+    QGIS 3.22 or newer opens it. Of the folder of a batch each pair that is done gets one. Files of these names are
+    replaced: save changes in QGIS under another name.
     """  # noqa: D301 (\b keeps the line breaks in click)
+    from sat_intervals.run.status import runs_of
     from sat_intervals.show.project import write_project
 
-    for file in write_project(out):
-        click.echo(file)
+    for run in runs_of(out):
+        for file in write_project(run):
+            click.echo(file)

@@ -61,3 +61,12 @@ def read_report(out: Path) -> dict[str, dict[str, Any]] | None:
         raise SatIntervalsError(
             f"{out / REPORT} is not the report of a batch: move it away and rerun the batch"
         ) from error
+
+
+def runs_of(out: Path) -> list[Path]:
+    """Return the folder of a run or, of a batch, those of its pairs that are done; raise if none is."""
+    if (pairs := read_report(out)) is None:
+        return [out]
+    if runs := [out / name for name, ended in pairs.items() if ended["state"].startswith("done")]:
+        return runs
+    raise SatIntervalsError(f"{out} is a batch, and none of its pairs is done: {', '.join(pairs)}: see status {out}")

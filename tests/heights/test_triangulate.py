@@ -387,6 +387,17 @@ def test_batch_command__rows_with_models_and_grids_go_on_to_a_surface(tmp_path):
     assert read(out / "a" / "dsm.tif").shape[1] < 60  # made again
     assert batch(f"a,{images},{sensors},1", f"b,{images},{sensors},1").exit_code == 0
     assert (out / "b" / "dsm.tif").exists()
+    assert invoke("dsm", out, "--resolution", 1).exit_code == 0
+    with rasterio.open(out / "dsm.tif") as fused:
+        assert len(fused.tags()["RUNS"].split()) == 2
+    for command, name in (("report", "report.html"), ("project", "project.qgz")):
+        made = invoke(command, out)
+        assert made.exit_code == 0, made.output
+        assert {str(out / pair / name) for pair in "ab"} <= set(made.stdout.split("\n"))
+    (out / "batch.json").write_text(json.dumps({"a": {"state": "failed", "error": "x"}}))
+    refused = invoke("report", out)
+    assert refused.exit_code == 2
+    assert f"{out} is a batch, and none of its pairs is done: a: see status {out}" in refused.stderr
 
 
 def test_surface_command__refuses_an_image_that_its_surface_would_replace(tmp_path):
