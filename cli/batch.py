@@ -33,6 +33,8 @@ def batch(pairs: Path, out: Path, settings: SettingsArguments, run: RunArguments
     from sat_intervals.workflows.batch import match_batch
 
     check_not_replaced([pairs, settings.file], [out / REPORT])
+    if run.dry_run and run.says_job(settings.load(), out):
+        return
     doubts: list[str] = []
     with run.console() as console:
 

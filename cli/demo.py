@@ -56,6 +56,8 @@ def demo(
     OUT/truth.tif                 the exact heights
     and the files of `surface`.
     """  # noqa: D301 (\b keeps the line breaks in click)
+    if run.dry_run and run.says_job(settings.load(images or 2), out):
+        return
     if images:
         _demo_of_many(out, images, size, settings, run, seed=seed, relief=relief)
         return

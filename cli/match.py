@@ -5,22 +5,16 @@ from pathlib import Path
 import click
 
 from sat_intervals.cli.images import PairArguments, pair_options
-from sat_intervals.cli.matching import (
-    RunArguments,
-    SettingsArguments,
-    run_options,
-    search_options,
-)
-from sat_intervals.cli.options import FILE, Grouped, expert_option
+from sat_intervals.cli.matching import RunArguments, SettingsArguments, run_options, search_options
+from sat_intervals.cli.options import FILE, Grouped
 
 
 @click.command(cls=Grouped, short_help="Match a pair: disparity, interval, confidence, validity.")
 @search_options
 @pair_options
 @click.argument("out", type=FILE)
-@expert_option("--dry-run", is_flag=True, help="Print the job script of the cluster; submit nothing.")
 @run_options
-def match(pair: PairArguments, out: Path, settings: SettingsArguments, dry_run: bool, run: RunArguments) -> None:
+def match(pair: PairArguments, out: Path, settings: SettingsArguments, run: RunArguments) -> None:
     """Match the epipolar images LEFT and RIGHT and write to the folder OUT.
 
     \b
@@ -34,10 +28,7 @@ def match(pair: PairArguments, out: Path, settings: SettingsArguments, dry_run: 
     from sat_intervals.cli.logs import warn
 
     config = settings.load()
-    if dry_run:
-        from sat_intervals.run.batch_system import job_script
-
-        click.echo(job_script(config.cluster, out))
+    if run.says_job(config, out):
         return
     with run.console() as console:
         settings.check_kept(out)

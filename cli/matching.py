@@ -56,6 +56,15 @@ class RunArguments(Printing):  # type: ignore[misc,unused-ignore]
     keep_tiles: bool
     overwrite: bool
     strict: bool
+    dry_run: bool
+
+    def says_job(self, config: "Config", out: Path) -> bool:
+        """Print the job script of the cluster if nothing else is to be done."""
+        if self.dry_run:
+            from sat_intervals.run.batch_system import job_script
+
+            click.echo(job_script(config.cluster, out))
+        return self.dry_run
 
     def match(
         self, left: "Image | Path", right: "Image | Path", out: Path, config: "Config", **more: Any
@@ -218,6 +227,7 @@ def run_options(command: Command) -> Command:
     with_run = gathered(
         "run",
         RunArguments,
+        expert_option("--dry-run", is_flag=True, help="Print the job script of the cluster; submit nothing."),
         expert_option("--strict", is_flag=True, help="End with status 1 if the run prints a warning."),
         expert_option("--keep-tiles", is_flag=True, help="Keep the products of tiles, until a call without it."),
         click.option(

@@ -56,6 +56,8 @@ def surface(
     images = pair.open()
     settings.check_kept(out, *(out / name for name in FILES))
     config = settings.load(len(images))
+    if run.says_job(config, out):
+        return
     with run.console() as console:
         done = surface(
             images,

@@ -123,12 +123,15 @@ def test_match__goes_on_in_a_new_job_when_the_walltime_ends(slurm, pair, tmp_pat
 
 
 @pytest.mark.peer("dask_jobqueue")
-def test_match__prints_the_job_script_and_submits_nothing(pair, tmp_path):
+@pytest.mark.parametrize(
+    "command", ["match left.tif right.tif", "surface left.tif right.tif --resolution 1", "batch -"]
+)
+def test_commands__print_the_job_script_and_submit_nothing(pair, tmp_path, command):
     settings = yaml.safe_load((pair / "settings.yaml").read_text())
     (tmp_path / "settings.yaml").write_text(yaml.safe_dump(settings | {"cluster": {"cores": 2, "memory": "3GB"}}))
-    command = [COMMAND, "match", pair / "left.tif", pair / "right.tif", tmp_path / "out"]
-    command += ["--config", tmp_path / "settings.yaml", "--cluster", "slurm", "--dry-run"]
-    script = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    words = [COMMAND, *command.split(), tmp_path / "out", "--config", tmp_path / "settings.yaml"]
+    words += ["--cluster", "slurm", "--dry-run"]
+    script = subprocess.run(words, cwd=pair, capture_output=True, text=True, check=True).stdout.splitlines()
     assert {"#SBATCH --cpus-per-task=2", "#SBATCH --mem=3G"} <= set(script)
     assert f"#SBATCH -e {tmp_path}/out/logs/dask-worker-%J.err" in script
     assert [path.name for path in tmp_path.iterdir()] == ["settings.yaml"]
