@@ -102,7 +102,7 @@ WIDTH = "width of the disparity interval"
 
 @dataclass(frozen=True)
 class Band:
-    """One band of a file: name (the GeoTIFF description), unit ("" for none) and meaning."""
+    """One band of a file: name (the GeoTIFF description), unit ("" for none, "1" beside metres) and meaning."""
 
     name: str
     unit: str
@@ -184,9 +184,9 @@ SURFACE = (
     Band("height", "m", "mean of the points that reach the cell, the nearer the heavier"),
     Band("height_lower", "m", "lower bound of the height"),
     Band("height_upper", "m", "upper bound of the height"),
-    Band("count", "", "points that reach the cell"),
-    Band("confidence", "", "mean of their confidences, 0 to 1, high = easy to match"),
-    Band("agreement", "", "1 where the intervals of several pairs meet, 0 where they do not; no data for one pair"),
+    Band("count", "1", "points that reach the cell"),
+    Band("confidence", "1", "mean of their confidences, 0 to 1, high = easy to match"),
+    Band("agreement", "1", "1 where the intervals of several pairs meet, 0 where they do not; no data for one pair"),
 )
 
 # Bands of the change of height between two surfaces.
@@ -194,8 +194,8 @@ CHANGE = (
     Band("difference", "m", "height after - height before"),
     Band("difference_lower", "m", "lower bound of the difference"),
     Band("difference_upper", "m", "upper bound of the difference"),
-    Band("significance", "", "probability of a difference as large, or larger, without a change"),
-    Band("change", "", "1 risen, -1 fallen, 0 neither, or in an area that is too small"),
+    Band("significance", "1", "probability of a difference as large, or larger, without a change"),
+    Band("change", "1", "1 risen, -1 fallen, 0 neither, or in an area that is too small"),
 )
 
 # The same of many images that were compared at heights.

@@ -100,9 +100,10 @@ def open_surface(path: str | Path, chunks: int | None = 2048) -> xr.Dataset:
     -------
     Dataset
         With the dimensions ``y`` and ``x``: ``height``, ``height_lower``, ``height_upper`` (metres), ``count``,
-        ``confidence`` and ``agreement``, NaN where unknown. The coordinate ``spatial_ref`` has CRS and transform by the
-        CF conventions. Attributes are ``vertical_datum``, what heights are above, the ``coverage`` or ``alpha`` of the
-        intervals. A change has ``difference``, its bounds, ``significance`` and ``change``.
+        ``confidence`` and ``agreement``, NaN where unknown. The coordinate ``spatial_ref`` has the CRS, with that of
+        heights, and the transform by the CF conventions. Attributes are ``vertical_datum``, what heights are above,
+        the ``coverage`` or ``alpha`` of the intervals. A change has ``difference``, its bounds, ``significance`` and
+        ``change``.
 
     Raises
     ------
@@ -111,7 +112,9 @@ def open_surface(path: str | Path, chunks: int | None = 2048) -> xr.Dataset:
     """
     file = Path(path)
     changes = is_change(file)
-    shape, place = read_place(file) if changes else surface_place(file)
+    if not changes:
+        surface_place(file)
+    shape, place = read_place(file, is_flat=False)
     dataset = xr.Dataset(coords=_coordinates(place, shape))
     dataset.attrs = {"title": "change of height" if changes else _SURFACE, "source": "sat-intervals"}
     dataset.attrs |= _attributes_of_surface(file)

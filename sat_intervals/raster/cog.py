@@ -20,17 +20,22 @@ from sat_intervals.raster import gdal
 from sat_intervals.raster.blocks import AROUND, BLOCK, factors, tiled
 from sat_intervals.raster.files import File
 from sat_intervals.raster.georeferencing import Georeferencing
+from sat_intervals.raster.vertical import with_vertical
 
 # Side of a block of the template, the smallest of GDAL's COG driver: larger ones take time and hold nothing.
 _SMALL = 128
 _CLASSIC = 1 << 32  # size from which a file is a BigTIFF
 # Tags of a TIFF directory, its types, and their sizes in bytes.
 _WIDTH, _HEIGHT, _BLOCK_WIDTH, _BLOCK_HEIGHT, _OFFSETS, _SIZES = 256, 257, 322, 323, 324, 325
-_SHORT, _LONG, _LONG8 = 3, 4, 16
-_BYTES = {1: 1, 2: 1, _SHORT: 2, _LONG: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, _LONG8: 8}
+_KEYS, _TEXTS = 34735, 34737  # of a CRS
+_ASCII, _SHORT, _LONG, _LONG8 = 2, 3, 4, 16
+_BYTES = {1: 1, _ASCII: 1, _SHORT: 2, _LONG: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, _LONG8: 8}
 
 Directory = dict[int, tuple[int, int, bytes]]
 """Type, count and values of each tag."""
+
+Template = tuple[bytes, list[Directory]]
+"""Ghost area and directories of a file and its first overview."""
 
 
 class Part(NamedTuple):
@@ -49,8 +54,8 @@ CopyParts = Callable[[Path, Sequence[tuple[int, Part]]], None]
 """Writes parts into a file, each at its offset."""
 
 
-def template(file: File, place: Georeferencing, tags: Mapping[str, str]) -> bytes:
-    """Return a small Cloud-Optimized GeoTIFF with one overview and all tags of a file."""
+def template(file: File, place: Georeferencing, tags: Mapping[str, str]) -> Template:
+    """Return what a small Cloud-Optimized GeoTIFF with one overview has in common with a file: all other tags."""
     # It is made in memory: GDAL says nothing of some failures to write to a disk.
     kind = {"count": len(file.bands), "dtype": file.dtype, "nodata": file.nodata, "sparse_ok": True}
     options = {"COMPRESS": file.compression.upper(), "PREDICTOR": file.predictor, "BLOCKSIZE": _SMALL}
@@ -60,11 +65,17 @@ def template(file: File, place: Georeferencing, tags: Mapping[str, str]) -> byte
             dataset.update_tags(**tags)
             file.describe(dataset)
         copy(small.name, made.name, driver="COG", SPARSE_OK="YES", OVERVIEW_RESAMPLING="NEAREST", **options)
-        return bytes(made.getbuffer())
+        ghost, directories = _parsed(bytes(made.getbuffer()))
+    whole = directories[0]
+    level = tags.get("HEIGHTS", "")
+    if file.is_of_heights and level.startswith("above") and place.crs:
+        keys, texts = with_vertical(place.crs, level, whole[_KEYS][2], whole[_TEXTS][2])
+        whole |= {_KEYS: (_SHORT, len(keys) // 2, keys), _TEXTS: (_ASCII, len(texts), texts)}
+    return ghost, directories
 
 
 def assemble(
-    path: Path, made: bytes, shape: tuple[int, int], levels: Sequence[Sequence[Part]], copy_parts: CopyParts
+    path: Path, made: Template, shape: tuple[int, int], levels: Sequence[Sequence[Part]], copy_parts: CopyParts
 ) -> None:
     """Write a file in place from its `template` and the rows of blocks of each level, from the top; see `factors`."""
     sizes = [[size for part in level for size in part.sizes] for level in levels]
@@ -77,9 +88,9 @@ def assemble(
     copy_parts(path, list(zip(offsets, parts, strict=True)))
 
 
-def header(made: bytes, shape: tuple[int, int], sizes: Sequence[Sequence[int]]) -> bytes:
+def header(made: Template, shape: tuple[int, int], sizes: Sequence[Sequence[int]]) -> bytes:
     """Return all that comes before the first block: `template`, rows and columns, bytes of the blocks of each level."""
-    ghost, (whole, overview) = _parsed(made)
+    ghost, (whole, overview) = made
     directories = []
     for factor, of_level in zip(factors(*shape), sizes, strict=True):
         height, width = (-(-side // factor) for side in shape)
@@ -127,7 +138,7 @@ def _written(
     return bytes(out)
 
 
-def _parsed(made: bytes) -> tuple[bytes, list[Directory]]:
+def _parsed(made: bytes) -> Template:
     """Return the ghost area and the directories of a small TIFF."""
     (place,) = struct.unpack_from("<4xI", made)
     ghost, directories = made[8:place], []

@@ -42,6 +42,11 @@ class File:
         """Return the name without its suffix."""
         return self.name.partition(".")[0]
 
+    @property
+    def is_of_heights(self) -> bool:
+        """Return whether its first band is metres: then its CRS is vertical, too."""
+        return self.bands[0].unit == "m"
+
     def describe(self, dataset: DatasetWriter) -> None:
         """Write names, units and meanings of the bands."""
         for index, band in enumerate(self.bands, start=1):

@@ -165,7 +165,8 @@ class Frame:
 def _check_ellipsoid(name: str, whole: CRS, vertical: Vertical, level: str) -> None:
     """Raise if heights refer to a geoid, or to nothing that is known."""
     datum = whole.sub_crs_list[1].name if whole.is_compound else ""
-    if datum and "ellipsoid" not in datum.lower() and (not level or level.endswith("ellipsoid")):
+    is_stated = vertical.ellipsoid and level and not level.endswith("ellipsoid")
+    if datum and "ellipsoid" not in datum.lower() and not is_stated:
         raise SatIntervalsError(
             f"{name} has heights of {datum}: give the grid of this geoid with --geoid, to sat-intervals reference"
         )

@@ -1,5 +1,6 @@
 """Read rasters on the grid of a surface model."""
 
+from dataclasses import replace
 from math import ceil, floor
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.heightfield import is_ground, other_unit, warn_of_no_data
 from sat_intervals.raster.images import opened
+from sat_intervals.raster.vertical import horizontal
 from sat_intervals.tiling import Window
 
 Bounds = tuple[float, float, float, float]
@@ -38,10 +40,14 @@ def is_change(path: Path) -> bool:
         return tuple(dataset.descriptions) == tuple(band.name for band in CHANGE)
 
 
-def read_place(path: Path) -> tuple[tuple[int, int], Georeferencing]:
-    """Return rows and columns of a raster, and its georeferencing, which must be north up."""
+def read_place(path: Path, *, is_flat: bool = True) -> tuple[tuple[int, int], Georeferencing]:
+    """Return rows and columns of a raster, and its georeferencing, which must be north up.
+
+    The CRS is horizontal, or has heights, too, where the file says so and ``is_flat`` is False.
+    """
     with opened(str(path)) as dataset:
         place = Georeferencing.of(dataset)
+        place = replace(place, crs=horizontal(place.crs) if is_flat else place.crs)
         if place.crs is None or place.transform is None or place.transform.b or place.transform.d:
             raise SatIntervalsError(f"{path} has no CRS or is not north up: give a north-up raster with a CRS")
         return dataset.shape, place
