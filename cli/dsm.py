@@ -106,6 +106,11 @@ def calibration_option(*names: str) -> Callable[[options.Command], options.Comma
     )
 
 
+ortho_option = click.option(
+    "--ortho", is_flag=True, help="Write ortho.tif beside it: the raw left image, of many their median, on its grid."
+)
+
+
 def say_surface(console: "Console", report: dict[str, Any]) -> None:
     """Print what a surface has: cells, filled share, half widths, and what was left out."""
     from sat_intervals.heights.cells import WIDE
@@ -157,6 +162,7 @@ def say_surface(console: "Console", report: dict[str, Any]) -> None:
 @click.option(
     "--reference", type=options.FILE, help="Raster of heights, above the same datum, that each OUT is moved onto."
 )
+@ortho_option
 @click.option("--output", type=options.FILE, help="File to write; default dsm.tif in the first OUT.")
 @options.overwrite_option
 @options.sensor_options
@@ -166,6 +172,7 @@ def dsm(
     cells: dict[str, Any],
     aligns: bool,
     reference: Path | None,
+    ortho: bool,
     output: Path | None,
     overwrite: bool,
     sensor_files: list[options.SensorFiles],
@@ -189,11 +196,14 @@ def dsm(
     hull.
     """
     from sat_intervals.heights.dsm import make_surface
+    from sat_intervals.raster.publishing import check_free
     from sat_intervals.run.status import runs_of
 
     output = options.output_file(output, outs[0] / "dsm.tif", overwrite=overwrite)
+    if ortho and output.parent != outs[0]:
+        check_free(output.with_name("ortho.tif"), overwrite=overwrite)
     outs = tuple(run for out in outs for run in runs_of(out))
-    cells["choices"] = replace(cells["choices"], aligns=aligns, reference=reference)
+    cells["choices"] = replace(cells["choices"], aligns=aligns, reference=reference, ortho=ortho)
     with printing.console() as console:
         options.note_geometry(outs, sensor_files)
         report = make_surface(outs, output, **cells, progress=console.progress)

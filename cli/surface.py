@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from sat_intervals.cli.dsm import calibration_option, cell_options, say_surface
+from sat_intervals.cli.dsm import calibration_option, cell_options, ortho_option, say_surface
 from sat_intervals.cli.images import PairArguments, ground_options, many_options
 from sat_intervals.cli.matching import RunArguments, SettingsArguments, run_options, search_options
 from sat_intervals.cli.options import FILE, Grouped, sensor_options
@@ -22,7 +22,7 @@ from sat_intervals.cli.rectify import raw_options, say_rectified
 @cell_options
 @calibration_option("--height-calibration")
 @ground_options
-@click.option("--ortho", is_flag=True, help="Three images or more: write OUT/ortho.tif, their median on the surface.")
+@ortho_option
 @run_options
 def surface(
     pair: PairArguments,

@@ -189,6 +189,9 @@ SURFACE = (
     Band("agreement", "1", "1 where the intervals of several pairs meet, 0 where they do not; no data for one pair"),
 )
 
+# The ortho-image beside a surface model.
+ORTHO = "ortho.tif"
+
 # Bands of the change of height between two surfaces.
 CHANGE = (
     Band("difference", "m", "height after - height before"),

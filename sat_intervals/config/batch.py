@@ -36,7 +36,7 @@ _ONLY_OF = {
         *("window", "minimum", "maximum", "radius", "dem", "altitude", "resolution_of", *_PATHS[:6]),
         *("left_nodata", "right_nodata", "left_band", "right_band"),
     ),
-    "three images or more": ("extent", "heights", "ortho"),
+    "three images or more": ("extent", "heights"),
 }
 
 

@@ -34,6 +34,8 @@ class SurfaceChoices:
     aligns, reference
         Whether several runs are moved onto each other first, and a raster of heights, above the same datum, that each
         run is moved onto.
+    ortho
+        Whether the raw left image of the first run, resampled to the surface, is written beside it as ``ortho.tif``.
     """
 
     bounds: Bounds | None = None
@@ -45,6 +47,7 @@ class SurfaceChoices:
     calibration: HeightCalibration | None = None
     aligns: bool = True
     reference: Path | None = None
+    ortho: bool = False
 
     def __post_init__(self) -> None:
         if self.bounds is not None and self.bounds not in BOUNDS:

@@ -14,12 +14,16 @@ from sat_intervals.heights.cells import CellCounts, Strip, strips
 from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.geometry import FILE, Geometry, geometry_of
 from sat_intervals.heights.lattice import Ground, joined, on_map
+from sat_intervals.heights.ortho import write_ortho_of
 from sat_intervals.heights.point_cloud import Cells, PointCloud
+from sat_intervals.heights.rectify import raw_inputs
 from sat_intervals.machine import usable_cores
+from sat_intervals.products import ORTHO
 from sat_intervals.progress import Progress
 from sat_intervals.raster import OutputWriter, Projection, files_of, north_up, read_place, surface_file, utm_of
 from sat_intervals.raster.georeferencing import horizontal_name
 from sat_intervals.raster.heightfield import warn_of_no_data
+from sat_intervals.raster.identity import check_not_replaced, identities
 from sat_intervals.raster.surfaces import check_level
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
@@ -85,7 +89,7 @@ def make_surface(
     grid, resolution, crs, radius = checked_cells(resolution, crs, radius, geoid)
     level = f"above {geoid or 'the WGS 84 ellipsoid'}"
     _check_reference(choices.reference, path, level)
-    geometries = _geometries(outs, path, given, progress)
+    geometries = _geometries(outs, [path, path.with_name(ORTHO)][: 1 + choices.ortho], given, progress)
     runs = [geometry.run for geometry in geometries]
     intervals = [run.config.interval for run in runs]
     choices = choices.for_intervals(intervals)
@@ -102,11 +106,10 @@ def make_surface(
             clouds, shifts = aligned(threads, clouds, cells, crs, radius, choices.reference)
             cells = _cells(threads, clouds, resolution, radius, grid)
         tally = _write(path, strips(threads, clouds, cells, radius, choices), cells, crs, tags, progress)
-    return {
-        "crs": crs,
-        "rows": cells.rows,
-        "columns": cells.columns,
-        **tally.report(cells.rows * cells.columns),
+    if choices.ortho:
+        write_ortho_of(runs[0], path, projection, shifts[0]["shift"] if shifts else (0, 0, 0), progress)
+    figures = tally.report(cells.rows * cells.columns)
+    return {"crs": crs, "rows": cells.rows, "columns": cells.columns, **figures} | {
         "bounds": choices.bounds,
         "calibration": choices.calibration and choices.calibration.name,
         "shifts": shifts,
@@ -145,10 +148,16 @@ def _write(
 
 
 def _geometries(
-    outs: Sequence[str | Path | Run], path: Path, given: Iterable[str | Path | None], progress: Progress
+    outs: Sequence[str | Path | Run], written: Sequence[Path], given: Iterable[str | Path | None], progress: Progress
 ) -> list[Geometry]:
-    """Return the geometry of each run; raise if one is given twice, or its files or given ones would be replaced."""
+    """Return the geometry of each run; raise if one is given twice, or its files or given ones would be replaced.
+
+    Of two files that are written, the second is an ortho-image of the raw image of the first run.
+    """
     runs = [out if isinstance(out, Run) else open_run(out) for out in outs]
+    if len(written) > 1:
+        pair = (runs[0].report["inputs"][side]["path"] for side in ("left", "right"))
+        check_not_replaced(identities(raw_inputs(*pair)), written)
     known: dict[str, Path] = {}
     for run in runs:
         other = known.setdefault(run.report["finished"], run.out)
@@ -157,7 +166,7 @@ def _geometries(
     geometries = []
     for run in runs:
         geometries.append(geometry_of(run, progress))
-        run.check_kept([path], [run.out / FILE, *geometries[-1].files, *given])
+        run.check_kept(written, [run.out / FILE, *geometries[-1].files, *given])
     return geometries
 
 

@@ -16,6 +16,7 @@ from sat_intervals.progress import Progress
 from sat_intervals.raster import File, Georeferencing, Image, OutputWriter, check_not_replaced, describe
 from sat_intervals.raster.identity import absolute_in, identities, identity, relative_in
 from sat_intervals.raster.publishing import check_free, write_record
+from sat_intervals.results import open_input
 from sat_intervals.store.lock import locked
 from sat_intervals.store.manifest import differences
 
@@ -188,3 +189,14 @@ def rectified_files(left: str | Path, right: str | Path) -> tuple[Path, Path, Pa
         raise SatIntervalsError(f"{folder} holds an unfinished pair: rerun rectify")
     left_model, right_model = (Path(record["inputs"][f"{side}_model"]["path"]) for side in ("left", "right"))
     return left_model, right_model, folder / GRIDS[0], folder / GRIDS[1]
+
+
+def raw_inputs(left: str | Path, right: str | Path) -> dict[str, Any]:
+    """Return the records of raw images and models of an epipolar pair; raise if `rectify` has not made it."""
+    if not rectified_files(left, right):
+        raise SatIntervalsError(
+            f"{left} was not rectified by sat-intervals, so its raw image is unknown: leave out ortho"
+        )
+    inputs = dict((read_record(Path(left).parent) or {})["inputs"])
+    open_input(inputs["left"])  # raises if it is missing
+    return inputs

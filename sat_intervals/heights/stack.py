@@ -7,10 +7,9 @@ import numpy as np
 
 from sat_intervals.config import Config
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.heights.ortho import ortho
 from sat_intervals.heights.shifts import Sample
 from sat_intervals.kernels.disparity import median
-from sat_intervals.kernels.resampling import resample
-from sat_intervals.kernels.row_offsets import AFTER, BEFORE
 from sat_intervals.match.ground import BLOCK, GroundViews
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.matching_cost import Given
@@ -18,7 +17,7 @@ from sat_intervals.match.patch import PatchFrame, match_patch, patch_areas
 from sat_intervals.match.sweep import SweepCost
 from sat_intervals.prepare.pair import Each
 from sat_intervals.raster import Image, read_reduced_views
-from sat_intervals.tiling import Grid, View, Views, Window
+from sat_intervals.tiling import Grid, Views, Window
 
 try:
     from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
@@ -169,17 +168,6 @@ def samples_of(stack: Stack, each: Each, *, is_coarse: bool) -> list[Sample]:
     return [found[i] for i in range(len(cores))]
 
 
-def ortho(view: View, places: np.ndarray) -> np.ndarray:
-    """Return an image resampled to positions of cells, ``(rows, columns, 2)``, see `GroundViews.positions`."""
-    nodes = np.pad(places, ((0, 1), (0, 1), (0, 0)), mode="edge")
-    around = Window.around(places.min(axis=(0, 1)) - BEFORE, places.max(axis=(0, 1)) + AFTER + 1)
-    pixels = np.full((around.height, around.width), np.float32(np.nan))
-    inside = around.clipped(view.window)
-    if inside.height and inside.width:
-        pixels[inside.relative_to(around).slices] = view.pixels[inside.relative_to(view.window).slices]
-    return np.asarray(resample(pixels, (around.row, around.column), nodes, 1, (0, 0), *places.shape[:2]))
-
-
 def _alike(values: np.ndarray) -> np.ndarray:
     """Return grey values without their local mean, over their local deviation; NaN near NaN."""
     usable = np.isfinite(values)
@@ -189,10 +177,3 @@ def _alike(values: np.ndarray) -> np.ndarray:
     deviation = np.sqrt(np.maximum(uniform_filter(away**2, _LOCAL) / share, 0))
     scale = deviation + 0.05 * (deviation[usable].mean() if usable.any() else 1.0) + 1e-9
     return np.where(usable, away / scale, np.nan)
-
-
-def median_of(values: np.ndarray) -> np.ndarray:
-    """Return the median along the first axis, without NaN; much faster than `numpy.nanmedian`."""
-    ordered, count = np.sort(values, axis=0), np.isfinite(values).sum(axis=0)
-    low, high = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, len(values) - 1)
-    return np.asarray(np.take_along_axis(ordered, np.stack([low, high]), axis=0).mean(axis=0))

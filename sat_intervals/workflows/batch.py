@@ -16,6 +16,7 @@ from sat_intervals.config.presets import merged
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.dsm import check_sensors
+from sat_intervals.heights.rectify import raw_inputs
 from sat_intervals.prepare.pair import Each
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, OutputError, files_of, open_image
@@ -32,7 +33,7 @@ from sat_intervals.run.status import read_report
 from sat_intervals.run.workers import Workers
 from sat_intervals.store.lock import locked
 from sat_intervals.tiling import Window
-from sat_intervals.workflows.many import FIGURES, ORTHO, Wanted, asked_of, complete_sweep, sweep_job
+from sat_intervals.workflows.many import FIGURES, Wanted, asked_of, complete_sweep, sweep_job
 from sat_intervals.workflows.surface import FILES, Rectified, check_cells, epipolar_pair, has_grids, surface_of
 
 _LOG = logging.getLogger(__name__)
@@ -122,7 +123,7 @@ def _check_not_replaced(pairs: Sequence[PairOfBatch], others: Sequence[str | Pat
     named = [name for pair in pairs for name in (*(pair.sensors or ()), *named_files(pair.settings))]
     names = {str(name) for name in (*others, *images, *named, *files) if name}
     read = [file for name in names for file in _files(name)]
-    surfaces = [out / pair.name / name for pair in pairs if pair.resolution for name in (*FILES, ORTHO)]
+    surfaces = [out / pair.name / name for pair in pairs if pair.resolution for name in FILES]
     outputs = [out / REPORT, *(folder / name for folder in folders for name in OUTPUTS), *surfaces]
     check_not_replaced(read, outputs, [folder / "tiles" for folder in folders])
 
@@ -183,6 +184,8 @@ class _Surfaces:
         raw = {name: pair.options.get(name) for name in ("dem", "altitude", "resolution_of")}
         raw["geoid"] = pair.options.get("geoid") if raw["dem"] else None
         made = epipolar_pair(images, out, sensors, _window(pair), self._on_rectified, **raw, **self._how)
+        if pair.options.get("ortho"):
+            raw_inputs(made.left.path, made.right.path)
         if not has_grids(sensors):
             check_sensors(made.sensors, pair.resolution, pair.options.get("crs"))
         self._sensors[pair.name] = made.sensors
@@ -195,7 +198,7 @@ class _Surfaces:
                 raise self._errors[pair.name]
             out, progress = self._out / pair.name, self._how["progress"]
             if not pair.more:
-                cells = _cells(pair) | {"choices": _choices(pair)}
+                cells = {**_cells(pair), "choices": _choices(pair)}
                 return {"surface": surface_of(out, self._sensors[pair.name], progress, **cells)}
             if pair.name in self._orthos:
                 from sat_intervals.workflows.ortho import write_ortho
@@ -212,7 +215,8 @@ def _cells(pair: PairOfBatch) -> dict[str, Any]:
 
 def _choices(pair: PairOfBatch) -> SurfaceChoices:
     file = pair.options.get("height_calibration")
-    return SurfaceChoices(calibration=load_height_calibration(file) if file else None)
+    margins = load_height_calibration(file) if file else None
+    return SurfaceChoices(calibration=margins, ortho=pair.options.get("ortho", False))
 
 
 def _opened(pair: PairOfBatch) -> list[Image]:

@@ -15,7 +15,7 @@ from sat_intervals.match.ground import GroundViews
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.prepare.pair import Each, FilePair
 from sat_intervals.prepare.prepared import Prepared
-from sat_intervals.products import plain
+from sat_intervals.products import ORTHO, plain
 from sat_intervals.progress import Progress, logged_stage
 from sat_intervals.raster import Image, Projection, find_model, north_up, utm_of
 from sat_intervals.raster.identity import check_not_replaced, identities, identity
@@ -35,7 +35,6 @@ from sat_intervals.store.manifest import digest
 from sat_intervals.store.tiles import home_of
 from sat_intervals.tiling import Window
 
-ORTHO = "ortho.tif"
 # Ends of an extent in whole cells; cells that it may have.
 _ENDS = math.floor, math.floor, math.ceil, math.ceil
 _MOST_CELLS = 10**11

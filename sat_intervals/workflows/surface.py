@@ -10,8 +10,9 @@ from sat_intervals.errors import SatIntervalsError, check_absent
 from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.dsm import check_sensors, checked_cells, make_surface, surface_tags
 from sat_intervals.heights.geometry import geometry_warnings, set_geometry
-from sat_intervals.heights.rectify import IMAGES, rectified_files
+from sat_intervals.heights.rectify import IMAGES, raw_inputs, rectified_files
 from sat_intervals.match.costs import check_cost
+from sat_intervals.products import ORTHO
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, check_not_replaced, files_of, open_image
 from sat_intervals.run.pair import match_pair
@@ -21,7 +22,7 @@ from sat_intervals.workflows.many import Wanted, surface_of_many
 from sat_intervals.workflows.rectify import rectify
 
 # What is made of a run, in its folder.
-FILES = "geometry.json", "dsm.tif"
+FILES = "geometry.json", "dsm.tif", ORTHO
 
 Rectified = Callable[[dict[str, Any]], None]
 """Called with what `rectify` returns, as soon as raw images are an epipolar pair."""
@@ -93,7 +94,7 @@ def surface(
         Of three images or more: lowest and highest height of the ground, metres above ``geoid`` or the ellipsoid; by
         default found.
     ortho
-        Of three images or more: whether to write ``out/ortho.tif``, their median, resampled to the surface.
+        Whether to write ``out/ortho.tif``: the left raw image, or the median of more, resampled to the surface.
     progress
         Callback, see `Progress`.
     on_rectified
@@ -124,18 +125,20 @@ def surface(
         check_absent(raw | {"window": window, "radius": radius, "a choice of points": of_points}, "two images")
         wanted = Wanted(resolution, crs, geoid, extent, heights, sensors, ortho, choices.calibration)
         return surface_of_many(opened, out, config, wanted, keep_tiles=keep_tiles, **how)
-    check_absent({"extent": extent, "heights": heights, "ortho": ortho or None}, "three images or more")
+    check_absent({"extent": extent, "heights": heights}, "three images or more")
     check_cost(config)
     cells = {"resolution": resolution, "crs": crs, "radius": radius, "geoid": geoid}
     check_cells(cells, choices, resolved(config).interval)
     pair = epipolar_pair(opened, out, sensors, window, on_rectified, geoid=geoid if dem else None, **raw, **how)
+    if ortho:
+        raw_inputs(pair.left.path, pair.right.path)
     grid = files_of(str(resolution)) if isinstance(resolution, Path) else ()
     read = [file for one in opened for file in (one.path, one.mask)]
     results = [out / name for name in (*OUTPUTS, *FILES)]
     check_not_replaced([*read, *pair.sensors, geoid, *grid], results, [out / "tiles"])
     check_sensors(pair.sensors, resolution, crs)
     run = match_pair(pair.left, pair.right, out, config, window=window, keep_tiles=keep_tiles, **how)
-    made = surface_of(out, pair.sensors, progress, **cells, choices=choices)
+    made = surface_of(out, pair.sensors, progress, **cells, choices=replace(choices, ortho=ortho or choices.ortho))
     doubts = pair.record["warnings"] if pair.record else []
     warnings = [*doubts, *run["warnings"], *geometry_warnings(made["geometry"])]
     return {"rectify": pair.record, "run": run, "surface": made, "warnings": warnings}
