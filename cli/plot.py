@@ -47,7 +47,8 @@ def plot(
     OUT/range.png      for a found or local search range: matches, cells
     OUT/profile.png    with --row: interval, disparity and truth along a row
     OUT/curve.png      with --pixel: cost curve of a pixel and its interval
-    OUT/dsm.png        with dsm.tif: hillshade, height, half width, confidence
+    OUT/dsm.png        with dsm.tif: hillshade, up to 2000 cells with a pixel
+                       each, height, half width, confidence
     OUT/change.png     of a folder of `change`: significant changes of height
 
     Of three images and more, only dsm.png is drawn. Rows and columns count from 0 at the first pixel of

@@ -15,7 +15,8 @@ def project(out: Path) -> None:
 
     \b
     OUT/project.qgz           images, disparity, width, confidence, validity, and
-                              heights with hillshade after dsm
+                              heights with hillshade and ortho-image after dsm:
+                              then what is on no map is off
     OUT/width.vrt             interval width, computed when it is read
     OUT/dsm_half_width.vrt    half the width of the intervals of heights
     OUT/project.qgz           of a folder of `change`: change, difference,

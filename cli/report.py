@@ -15,9 +15,9 @@ def report(out: Path, truth: Path | None) -> None:
     """Write OUT/report.html, one self-contained file for any browser.
 
     It shows maps, the interval profile of any row, histograms, validity, tiles and seams, settings and times. With a
-    truth, it also shows how often the intervals contain it. For large images, maps and profiles show every n-th row and
-    column. Of a folder of `change` it has its figures and, once `plot` has drawn it, the map. Of the folder of a batch
-    each pair that is done gets its page.
+    truth, it also shows how often the intervals contain it; of a surface, hillshade, half widths and completeness. For
+    large images, maps and profiles show every n-th row and column. Of a folder of `change` it has its figures and, once
+    `plot` has drawn it, the map. Of the folder of a batch each pair that is done gets its page.
     """
     from sat_intervals.cli.tables import change_lines
     from sat_intervals.results import open_results, read_change

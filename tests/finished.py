@@ -17,7 +17,7 @@ MINIMUM, MAXIMUM = -20, 10
 FINISHED = "2026-11-21T12:00:00+00:00"
 
 
-def write_run(folder, bands, validity, truth=None, image=None):
+def write_run(folder, bands, validity, truth=None, image=None, place=PLACE):
     """Write a run of ``bands`` ``(4, rows, columns)``, with its images and, where given, the truth beside them.
 
     Returns the folder of the run, inside ``folder``.
@@ -26,13 +26,13 @@ def write_run(folder, bands, validity, truth=None, image=None):
         image = np.random.default_rng(0).integers(100, 1000, validity.shape)
     inputs = {"left": folder / "left.tif", "right": folder / "right.tif"}
     for path in inputs.values():
-        write_layer(path, image.astype(np.uint16), 0, PLACE)
+        write_layer(path, image.astype(np.uint16), 0, place)
     if truth is not None:
-        write_layer(folder / "truth.tif", truth.astype(np.float32), float("nan"), PLACE)
+        write_layer(folder / "truth.tif", truth.astype(np.float32), float("nan"), place)
     out = folder / "out"
     out.mkdir(parents=True, exist_ok=True)
     for file, raster in zip(RUN_FILES, (bands, validity), strict=True):
-        write_file(out / file.name, file, raster, PLACE)
+        write_file(out / file.name, file, raster, place)
     (out / "run.json").write_text(json.dumps(_report(inputs, bands, validity)))
     return out
 

@@ -22,6 +22,7 @@ from sat_intervals.raster import (
     read_place,
     read_reduced_views,
     read_small_layers,
+    read_tags,
 )
 from sat_intervals.results import Run, open_input
 from sat_intervals.tiling import View, Window
@@ -60,7 +61,8 @@ class Drape:
         """Write the ortho-image, the median of the images, beside the surface; an existing file is replaced."""
         (rows, columns), place = read_place(self.surface)
         file = File(ORTHO, "float32", float("nan"), (Band("grey level", "", meaning),))
-        with OutputWriter(self.surface.parent, [file], rows, columns, place, {"SOFTWARE": "sat-intervals"}) as writer:
+        tags = {"SOFTWARE": "sat-intervals", "RUNS": read_tags(self.surface).get("RUNS", "")}
+        with OutputWriter(self.surface.parent, [file], rows, columns, place, tags) as writer:
             for row in range(0, rows, _ROWS):
                 progress("ortho", row, rows)
                 height = min(_ROWS, rows - row)

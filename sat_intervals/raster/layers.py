@@ -11,6 +11,7 @@ import numpy as np
 from rasterio import Env
 from rasterio.crs import CRS
 from rasterio.io import MemoryFile
+from rasterio.shutil import copy
 from rasterio.transform import Affine
 from rasterio.windows import Window as RasterioWindow
 
@@ -51,6 +52,16 @@ def write_layer(
             dataset.update_tags(**tags)
             dataset.write(pixels, 1)
         temporary.write_bytes(memory.getbuffer())
+
+
+def png_of(pixels: np.ndarray) -> bytes:
+    """Return a picture: ``(bands, rows, columns)`` uint8, grey or colours, and opacity."""
+    count, height, width = pixels.shape
+    with Env(GDAL_PAM_ENABLED="NO"), MemoryFile() as plain, MemoryFile() as made:
+        with gdal.create(plain.name, count=count, height=height, width=width, dtype="uint8") as dataset:
+            dataset.write(pixels)
+        copy(plain.name, made.name, driver="PNG")
+        return bytes(made.getbuffer())
 
 
 def read_layers(path: str | os.PathLike[str], window: Window | None = None, band: int | None = None) -> np.ndarray:

@@ -130,6 +130,17 @@ def add_histogram(bar: Colorbar, widths: np.ndarray, end: float, step: float) ->
     side.patch.set_visible(False)
 
 
+def add_scale_bar(panel: Axes, frame: PlotFrame) -> None:
+    """Draw a bar of a round length, at most a fourth of the map, in its lower left corner."""
+    width, tall = frame.right - frame.left, frame.top - frame.bottom
+    decade = 10 ** np.floor(np.log10(width / 4))
+    length = float(max(step * decade for step in (1, 2, 5) if step * decade <= width / 4))
+    x, y = frame.left + 0.03 * width, frame.bottom + 0.03 * tall
+    panel.plot([x, x + length], [y, y], color="black", lw=4, solid_capstyle="butt")
+    label = panel.text(x + length / 2, y + 0.012 * tall, f"{length:g} m", ha="center", va="bottom", fontsize=9)
+    label.set_bbox({"facecolor": "white", "alpha": 0.7, "lw": 0, "pad": 1})
+
+
 def plain_logarithm(axis: Axis) -> None:
     """Label a logarithmic axis with plain numbers, such as 2, 5 and 10."""
     axis.set_major_locator(LogLocator(subs=(1, 2, 5)))

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 
 from sat_intervals.products import CHANGE
 from sat_intervals.raster import read_place, read_small_layers
@@ -42,15 +41,4 @@ def draw_change(change: Path, report: dict[str, Any], target: Path, dpi: int = c
         known = np.where(np.isfinite(bands["change"]), _UNCHANGED, 1.0)
         canvas.draw_layer(panel, frame, layer._replace(if_empty="no significant change"))
         panel.imshow(known, extent=frame[:4], cmap="gray", vmin=0, vmax=1, interpolation="nearest", zorder=-1)
-        _add_scale_bar(panel, frame)
-
-
-def _add_scale_bar(panel: Axes, frame: canvas.PlotFrame) -> None:
-    """Draw a bar of a round length, at most a fourth of the map, in its lower left corner."""
-    width, tall = frame.right - frame.left, frame.top - frame.bottom
-    decade = 10 ** np.floor(np.log10(width / 4))
-    length = float(max(step * decade for step in (1, 2, 5) if step * decade <= width / 4))
-    x, y = frame.left + 0.03 * width, frame.bottom + 0.03 * tall
-    panel.plot([x, x + length], [y, y], color="black", lw=4, solid_capstyle="butt")
-    label = panel.text(x + length / 2, y + 0.012 * tall, f"{length:g} m", ha="center", va="bottom", fontsize=9)
-    label.set_bbox({"facecolor": "white", "alpha": 0.7, "lw": 0, "pad": 1})
+        canvas.add_scale_bar(panel, frame)

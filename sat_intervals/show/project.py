@@ -4,7 +4,7 @@ import os
 import re
 import zipfile
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import BytesIO
 from logging import getLogger
 from pathlib import Path
@@ -13,8 +13,8 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.products import BANDS, CHANGE, SURFACE, SURFACE_OF_SWEEP
-from sat_intervals.raster import Georeferencing, open_image, read_layers, read_place, read_small_layers
+from sat_intervals.products import BANDS, CHANGE, ORTHO, SURFACE, SURFACE_OF_SWEEP
+from sat_intervals.raster import Georeferencing, open_image, read_layers, read_place, read_small_layers, read_tags
 from sat_intervals.raster.publishing import write_file
 from sat_intervals.raster.windows import read_small_image
 from sat_intervals.results import Run, open_input, open_run, read_change
@@ -24,9 +24,10 @@ from sat_intervals.tiling import Window
 
 _LONGEST = 1024  # pixels, longest side of what percentiles are taken from
 _MULTIPLY = 6  # QGIS' blend mode
+_HEIGHT = "height"  # the layer that is the terrain of 3D views
 _CHECKED = "Qt::Checked"
 _PROJECT = "project.qgz"
-_STYLED = "intervals", "width", "validity", "dsm", "dsm_half_width"  # rasters with a default style
+_STYLED = "intervals", "width", "validity", "dsm", "dsm_half_width", "ortho"  # rasters with a default style
 
 _LOG = getLogger(__name__)
 
@@ -59,19 +60,22 @@ def write_project(out: str | Path) -> list[Path]:
     """Write ``project.qgz`` to the folder of a finished run, and the default styles of its rasters; return the files.
 
     The project has the images and the truth, disparity, interval width, confidence and validity; if ``dsm.tif`` is
-    of this run, also its heights. Of a sweep of many images it has heights and validity, of a folder of `change` the
-    change of height. Paths in it are relative where
+    of this run, also its heights and ortho-image, and what is on no map is switched off. Of a sweep of many images it
+    has heights, ortho-image and validity, of a folder of `change` the change of height. Paths in it are relative where
     the files are local.
     """
     if read_change(out):
-        return _write(Path(out), [*_change(Path(out))], [])
+        return _write(Path(out), [*_change(Path(out))])
     run = open_run(out)
     names = (f"{name}{end}" for name in _STYLED for end in (".qml", ".vrt"))
     run.check_kept([run.out / name for name in (_PROJECT, *names)])
-    return _write(run.out, [*_surface(run), *_results(run)], [*_images(run)])
+    surface, layers = [*_surface(run)], [*_results(run), *_images(run)]
+    if surface and not run.georeferencing.crs:
+        layers = [replace(layer, is_shown=False) for layer in layers]
+    return _write(run.out, [*surface, *layers])
 
 
-def _write(out: Path, layers: list[ProjectLayer], images: list[ProjectLayer]) -> list[Path]:
+def _write(out: Path, layers: list[ProjectLayer]) -> list[Path]:
     """Write a project of layers, virtual rasters and styles; return the files."""
     written = {Path(layer.raster.source): layer.raster.virtual for layer in layers if layer.raster.virtual}
     for layer in layers:
@@ -79,7 +83,7 @@ def _write(out: Path, layers: list[ProjectLayer], images: list[ProjectLayer]) ->
             written[Path(layer.raster.source).with_suffix(".qml")] = styles.default_style(layer.renderer)
     content = BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
-        root = _project(out, [*layers, *images])
+        root = _project(out, layers)
         archive.writestr(zipfile.ZipInfo("project.qgs"), styles.text_of(root, styles.HEAD))
     written[out / _PROJECT] = content.getvalue()
     for path, text in written.items():
@@ -122,8 +126,21 @@ def _surface(run: Run) -> Iterator[ProjectLayer]:
     yield ProjectLayer(group, "half width", "half the width of the height's interval, m", half, wide, True)
     yield ProjectLayer(group, "confidence of heights", meanings["confidence"], surface, styles.shares(5))
     ramp = styles.colours(1, height, styles.VIRIDIS, unit="m")
-    yield ProjectLayer(group, "height", meanings["height"], surface, ramp, True, True, _MULTIPLY)
+    ortho = [*_ortho(run)]
+    yield ProjectLayer(group, _HEIGHT, meanings["height"], surface, ramp, True, not ortho, _MULTIPLY)
+    yield from ortho
     yield ProjectLayer(group, "hillshade", "shaded heights", surface, styles.hillshade(1), is_shown=True)
+
+
+def _ortho(run: Run) -> Iterator[ProjectLayer]:
+    """Yield the ortho-image beside the surface, if it is one of the same run."""
+    file = run.out / ORTHO
+    if file.exists() and read_tags(file).get("RUNS") == read_tags(run.out / "dsm.tif").get("RUNS"):
+        shape, place = read_place(file)
+        grey = styles.grey(1, read_small_layers(file, _fitting(shape))[0])
+        yield ProjectLayer(
+            "Heights", "ortho-image", "image on the surface", Raster(file, place, shape), grey, True, True
+        )
 
 
 def _change(out: Path) -> Iterator[ProjectLayer]:
@@ -186,6 +203,10 @@ def _project(out: Path, layers: list[ProjectLayer]) -> Element:
         about["checked"] = _CHECKED if layer.is_shown else "Qt::Unchecked"
         SubElement(groups[layer.group], "layer-tree-layer", about)
         _add_layer(listed, layer, key, source)
+        if layer.name == _HEIGHT:
+            terrain = SubElement(SubElement(root, "ElevationProperties"), "terrainProvider", type="raster")
+            given = {"layer": key, "layerName": layer.name, "layerSource": source, "layerProvider": "gdal"}
+            SubElement(terrain, "TerrainProvider", given, offset="0", scale="1")
     canvas = SubElement(root, "mapcanvas", name="theMapCanvas")
     styles.add_texts(canvas, units="meters")
     styles.add_texts(SubElement(canvas, "extent"), **_extent(first))

@@ -1,6 +1,7 @@
 """Draw a surface model: hillshade, height, interval width, confidence."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -10,19 +11,21 @@ from sat_intervals.show import canvas
 from sat_intervals.show.legend import limits
 from sat_intervals.show.relief import relief
 
-_LONGEST = 5.5  # inches of the longer side of a map
-_NO_DATA = "#a8c4dd"
+_LONGEST = 11.0  # inches of the longer side of the hillshade, of which titles and labels take a part
+_SHOWN = 10.0  # inches of it at least
+_SMALL = 2.8  # times that other maps are smaller
+_WIDE = 1.4  # ratio of the sides of a surface from which they are below the hillshade, not beside it
+_MOST_CELLS = 2000  # along a side, that have a pixel each
 # Percentile of half widths at the end of their scale, which is at most so many times their median: a strip of wide
 # intervals then leaves the others their colours.
 _MOST, _TIMES = 98, 12
 
 
 def draw_surface(surface: Path, target: Path, dpi: int = canvas.DPI) -> None:
-    """Draw hillshade, height, interval width and confidence, or agreement of runs, from the overviews."""
+    """Draw the hillshade with a pixel a cell, and small height, interval width, confidence or agreement of runs."""
     shape, place = surface_place(surface)
     assert place.crs is not None
-    inches = canvas.map_size(shape, _LONGEST)
-    drawn = canvas.fitting(shape, inches, dpi)
+    drawn = canvas.fitting(shape, canvas.map_size(shape, 1.0), _MOST_CELLS)
     bands = dict(zip((band.name for band in SURFACE), read_small_layers(surface, drawn), strict=True))
     height = bands["height"].astype(np.float64)
     halves = (bands["height_upper"] - bands["height_lower"]) / 2
@@ -31,14 +34,7 @@ def draw_surface(surface: Path, target: Path, dpi: int = canvas.DPI) -> None:
     ends = left + shape[1] * place.pixel_size[0], top - shape[0] * place.pixel_size[1]
     frame = canvas.PlotFrame(left, *ends, top, canvas.GROUND)
     middle, end = _middle_and_end(halves)
-    layers = [
-        canvas.MapLayer("Height", "m", height, "viridis", limits(height)),
-        canvas.MapLayer("Half width of the interval", "m", halves, "magma", (0, end), 0.5),
-        canvas.MapLayer("Agreement of runs", "1 where intervals overlap", bands["agreement"], "cividis", (0, 1)),
-    ]
-    if not np.isfinite(bands["agreement"]).any():
-        layers[2] = canvas.MapLayer("Confidence", "0 to 1", bands["confidence"], "cividis", (0, 1))
-    layers = [layer for layer in layers if np.isfinite(layer.values).any()]
+    layers = _layers(height, halves, bands, end)
     step = "" if drawn == shape else f", {drawn[0]} x {drawn[1]} of them drawn"
     filled = f"{100 * np.isfinite(height).mean():.1f} % filled"
     code = place.crs.to_epsg()
@@ -46,20 +42,48 @@ def draw_surface(surface: Path, target: Path, dpi: int = canvas.DPI) -> None:
         f"{surface.name}: {shape[0]} x {shape[1]} cells of {place.pixel_size[0]:g} m{step}, {filled}{middle}\n"
         f"{f'EPSG:{code}' if code else place.crs.to_string()[:60]}, heights {read_tags(surface).get('HEIGHTS', '')}"
     )
-    with canvas.page(target, (2 * (inches[1] + 1.4), 2 * (inches[0] + 0.7) + 0.3), dpi, caption) as figure:
-        first, *panels = figure.subplots(2, 2).ravel()
+    size, arranged = _arrangement(shape)
+    dots = max(dpi, -(-max(drawn) // _SHOWN))
+    with canvas.page(target, size, int(dots), caption) as figure:
+        first, *panels = figure.subplot_mosaic(**arranged).values()
         shade = relief(height, across, down)
         canvas.draw_map(
-            first, frame, shade, "Hillshade, sun in the north-west; blue: no data", cmap="gray", vmin=0, vmax=1
+            first, frame, shade, "Hillshade, sun in the north-west; hatched: no data", cmap="gray", vmin=0, vmax=1
         )
         canvas.say_empty(first, shade, "no value")
-        first.set_facecolor(_NO_DATA)  # flat ground is grey too
+        canvas.add_scale_bar(first, frame)
         for panel, layer in zip(panels, layers, strict=False):
             bar = canvas.draw_layer(panel, frame, layer)
             if layer.values is halves:
                 canvas.add_histogram(bar, halves, end, step=end / 40)
+        for panel in (first, *panels[: len(layers)]):
+            panel.patch.set(facecolor="white", hatch="////", edgecolor=canvas.NOTHING, linewidth=0)
         for panel in panels[len(layers) :]:
             panel.remove()
+
+
+def _layers(height: np.ndarray, halves: np.ndarray, bands: dict[str, np.ndarray], end: float) -> list[canvas.MapLayer]:
+    """Return the small maps that have values; half widths have colours up to ``end``."""
+    layers = [
+        canvas.MapLayer("Height", "m", height, "viridis", limits(height)),
+        canvas.MapLayer("Half width of the interval", "m", halves, "magma", (0, end), 0.5),
+        canvas.MapLayer("Agreement of runs", "1 where intervals overlap", bands["agreement"], "cividis", (0, 1)),
+    ]
+    if not np.isfinite(bands["agreement"]).any():
+        layers[2] = canvas.MapLayer("Confidence", "0 to 1", bands["confidence"], "cividis", (0, 1))
+    return [layer for layer in layers if np.isfinite(layer.values).any()]
+
+
+def _arrangement(shape: tuple[int, int]) -> tuple[tuple[float, float], dict[str, Any]]:
+    """Return width and height of the page in inches, and where hillshade and small maps are."""
+    tall, wide = canvas.map_size(shape, _LONGEST)
+    if wide > _WIDE * tall:
+        below = tall / _SMALL + 1.2
+        mosaic = [["shade"] * 3, ["height", "half", "last"]]
+        return (wide + 0.8, tall + below + 1.2), {"mosaic": mosaic, "height_ratios": (tall, below)}
+    rows = [["shade", name] for name in ("height", "half", "last")]
+    small = wide / _SMALL + 2.6  # with its colour bar
+    return (wide + small + 1.3, tall + 1.2), {"mosaic": rows, "width_ratios": (wide + 0.9, small)}
 
 
 def _middle_and_end(halves: np.ndarray) -> tuple[str, float]:

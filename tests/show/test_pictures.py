@@ -253,7 +253,7 @@ def test_plot__draws_the_surface_of_a_run(tmp_path, monkeypatch, words, shape, a
     write_surface(out, height, agreement)
     done = invoke("plot", out, "--dpi", "40")
     assert done.output.split() == [str(out / "overview.png"), str(out / "dsm.png")]
-    titles = ["Hillshade, sun in the north-west; blue: no data", "Height", "Half width of the interval", last]
+    titles = ["Hillshade, sun in the north-west; hatched: no data", "Height", "Half width of the interval", last]
     assert [word for word in words if word in titles][-4:] == titles
     assert len(np.unique(pixels_of(out / "dsm.png").reshape(-1, 3), axis=0)) > 20
 
@@ -285,6 +285,26 @@ def test_draw_surface__without_bounds(tmp_path, words, unrendered):
     write_file(tmp_path / "dsm.tif", surface_file("dsm.tif"), bands, PLACE)
     draw_surface(tmp_path / "dsm.tif", tmp_path / "dsm.png", dpi=40)
     assert "Height" in words
+
+
+@pytest.mark.parametrize("shape", [(1300, 300), (300, 1300), (1300, 1300)])
+def test_draw_surface__has_a_pixel_a_cell_and_no_data_is_white(tmp_path, monkeypatch, shape):
+    found = []
+
+    def measured(figure, file, dpi, **options):
+        figure.set_dpi(dpi)
+        figure.draw_without_rendering()
+        box = figure.axes[0].get_window_extent()
+        found.append(((box.height, box.width), [axes.patch for axes in figure.axes[:4]]))
+
+    monkeypatch.setattr(Figure, "savefig", measured)
+    height = np.add.outer(np.arange(shape[0]), np.arange(shape[1])).astype(np.float32)
+    bands = np.stack([height, height - 1, height + 1, *[height * 0 + 0.5] * 3])
+    write_file(tmp_path / "dsm.tif", surface_file("dsm.tif"), bands, PLACE)
+    draw_surface(tmp_path / "dsm.tif", tmp_path / "dsm.png", dpi=30)
+    ((size, patches),) = found
+    assert (np.array(size) >= shape).all()
+    assert all(patch.get_facecolor() == (1, 1, 1, 1) and patch.get_hatch() for patch in patches)
 
 
 def test_relief__is_bright_where_it_faces_the_sun():

@@ -11,12 +11,13 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import rasterio
-from finished import PLACE, no_bands, random_bands, without_intervals, write_run, write_surface
+from finished import FINISHED, NOWHERE, PLACE, no_bands, random_bands, without_intervals, write_run, write_surface
 from helpers import invoke
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from sat_intervals.products import INVALID
+from sat_intervals.raster import write_layer
 from sat_intervals.show.legend import PIXEL_CLASSES, classify
 
 SYSTEM_PYTHON = "/usr/bin/python3"
@@ -110,6 +111,46 @@ def test_write_project__leaves_out_what_is_missing_or_of_another_run(run):
     assert names == ["validity", "confidence", "interval width", "disparity", "truth", "left"]
 
 
+def write_ortho(out, runs=FINISHED):
+    grey = np.random.default_rng(1).uniform(100, 900, (60, 80)).astype(np.float32)
+    write_layer(out / "ortho.tif", grey, np.nan, PLACE, {"RUNS": runs})
+
+
+def test_write_project__drapes_the_ortho_image_over_the_terrain(run):
+    out, _, _ = run
+    write_ortho(out)
+    assert invoke("project", out).exit_code == 0
+    root = read_project(out)
+    assert [name for _, name, _ in layers_of(root)[1:5]] == [
+        "confidence of heights",
+        "height",
+        "ortho-image",
+        "hillshade",
+    ]
+    shown = {layer.get("name") for layer in root.iter("layer-tree-layer") if layer.get("checked") == "Qt::Checked"}
+    assert shown == {"ortho-image", "hillshade", "disparity", "left"}
+    terrain = root.find("ElevationProperties/terrainProvider[@type='raster']/TerrainProvider")
+    assert (terrain.get("layer"), terrain.get("layerSource"), terrain.get("scale")) == (
+        "heights_height",
+        "./dsm.tif",
+        "1",
+    )
+    assert ElementTree.parse(out / "ortho.qml").find(".//rasterrenderer").get("type") == "singlebandgray"
+    write_ortho(out, runs="earlier")
+    invoke("project", out)
+    assert "ortho-image" not in [name for _, name, _ in layers_of(read_project(out))]
+
+
+def test_write_project__of_a_surface_switches_off_what_is_on_no_map(tmp_path):
+    bands, validity, truth = random_bands(60, 80)
+    out = write_run(tmp_path, bands, validity, truth, place=NOWHERE)
+    for names in ({"disparity", "left"}, {"height", "hillshade"}):
+        assert invoke("project", out).exit_code == 0
+        layers = read_project(out).iter("layer-tree-layer")
+        assert {layer.get("name") for layer in layers if layer.get("checked") == "Qt::Checked"} == names
+        write_surface(out, np.ones((60, 80)))
+
+
 def test_write_project__of_a_run_without_intervals_and_without_valid_pixels(tmp_path):
     out = without_intervals(tmp_path)
     assert invoke("project", out).exit_code == 0
@@ -124,6 +165,7 @@ def test_project__in_qgis(run, tmp_path):
     if subprocess.run([SYSTEM_PYTHON, "-c", "import qgis.core"], capture_output=True).returncode:
         pytest.skip("QGIS is not installed for the system's Python: apt install python3-qgis qgis-providers")
     out, _, _ = run
+    write_ortho(out)
     assert invoke("project", out).exit_code == 0
     script = Path(__file__).with_name("render_project.py")
     done = subprocess.run(
@@ -143,6 +185,7 @@ def test_project__in_qgis(run, tmp_path):
     ramp = "singlebandpseudocolor"
     assert renderers == {
         "half width": (ramp, [1]), "confidence of heights": (ramp, [5]), "height": (ramp, [1]),
+        "ortho-image": ("singlebandgray", [1]),
         "hillshade": ("hillshade", [1]), "validity": ("paletted", [1]), "confidence": (ramp, [4]),
         "interval width": (ramp, [1]), "disparity": (ramp, [1]), "truth": (ramp, [1]),
         "left": ("singlebandgray", [1]), "right": ("singlebandgray", [1]),
@@ -150,7 +193,7 @@ def test_project__in_qgis(run, tmp_path):
     for name in ("half width", "height", "validity", "interval width", "disparity"):
         assert layers[name]["alone_labels"] == layers[name]["labels"] != []
     shown = {name for name, layer in layers.items() if layer["shown"]}
-    assert shown == {"height", "hillshade", "disparity", "left"}
+    assert shown == {"ortho-image", "hillshade", "disparity", "left"}
     for name in (*layers, "map"):
         with Image.open(tmp_path / f"{name.replace(' ', '_')}.png") as picture:
             colours = picture.convert("RGB").getcolors(1 << 20)

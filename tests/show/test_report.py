@@ -5,12 +5,14 @@ import gzip
 import json
 import re
 import tomllib
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
-from finished import MAXIMUM, MINIMUM, no_bands, random_bands, without_intervals, write_run
+from finished import MAXIMUM, MINIMUM, no_bands, random_bands, without_intervals, write_run, write_surface
 from helpers import invoke, wait_until
+from PIL import Image
 
 from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.products import INVALID
@@ -123,6 +125,24 @@ def test_write_report__shows_the_main_figures_without_scripts(tmp_path):
     shares = re.findall(r"<td>(\d+\.\d) % of the pixels</td>", static)
     assert sum(map(float, shares)) == pytest.approx(100, abs=0.4)
     assert page["classes"] == np.bincount(classify(validity).ravel()).tolist()
+
+
+def test_write_report__shows_hillshade_half_widths_and_completeness_of_a_surface(tmp_path):
+    bands, validity, truth = random_bands(60, 80)
+    out = write_run(tmp_path, bands, validity, truth)
+    height = np.add.outer(np.arange(40.0), np.arange(50.0) ** 2 / 9)
+    height[:, :10] = np.nan
+    write_surface(out, height)
+    path = write_report(open_results(out))
+    surface = contents_of(path)["surface"]
+    assert surface["figures"]["completeness, cells with a height"] == "80.0 %"
+    assert "<td>80.0 %</td>" in path.read_text(encoding="utf-8")
+    shade, half = (np.array(Image.open(BytesIO(base64.b64decode(one["png"])))) for one in surface["maps"])
+    assert (shade.shape, half.shape) == ((40, 50, 2), (40, 50, 4))
+    np.testing.assert_array_equal(half[..., -1], np.where(np.isfinite(height), 255, 0))
+    assert not shade[:, :10, -1].any()
+    assert len(np.unique(shade[:, 12:, 0])) > 10
+    assert half[5, 20].tolist() == [252, 253, 191, 255]  # all as wide as the widest
 
 
 @pytest.mark.peer("shareloc")

@@ -9,16 +9,12 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from sat_intervals.evaluate.disparity import evaluate_run
-from sat_intervals.raster import read_place, read_small_layers
 from sat_intervals.raster.publishing import write_file
 from sat_intervals.results import Results
 from sat_intervals.show.legend import class_counts, classes_of
 from sat_intervals.show.report.contents import Histograms, Pixels
-
-_CELLS = 1000  # rows and columns of a surface that are read
+from sat_intervals.show.report.surface import surface_of
 
 
 def write_report(results: Results) -> Path:
@@ -70,29 +66,9 @@ def _contents(results: Results) -> dict[str, Any]:
         "classes": class_counts(results.report["counts"]),
         "pixels": pixels.report(),
         "truth": truth,
-        "surface": _surface(results),
+        "surface": surface_of(results),
         "evaluation": evaluate_run(results.out, truth) if truth and results.config.interval else None,
     }
-
-
-def _surface(results: Results) -> dict[str, Any] | None:
-    """Return figures of the surface model of a run, None without one: metres and shares, from its overviews."""
-    if not results.has_current("dsm.tif"):
-        return None
-    (rows, columns), place = read_place(results.out / "dsm.tif")
-    small = -(-rows // max(1, rows // _CELLS)), -(-columns // max(1, columns // _CELLS))
-    height, lower, upper = read_small_layers(results.out / "dsm.tif", small)[:3].astype(np.float64)
-    known, halves = np.isfinite(height), (upper - lower)[np.isfinite(lower)] / 2
-    low, middle, high = np.percentile(height[known], (2, 50, 98)) if known.any() else [float("nan")] * 3
-    figures = {
-        "surface model": f"{rows} x {columns} cells of {place.pixel_size[0]:g} m",
-        "cells with a height": f"{100 * known.mean():.1f} %",
-        "heights, 2 %, median, 98 %": f"{low:.2f}, {middle:.2f}, {high:.2f} m",
-    }
-    if halves.size:
-        median, most = np.percentile(halves, (50, 90))
-        figures["half widths of intervals, median and 90 %"] = f"{median:.2f} m, {most:.2f} m"
-    return figures
 
 
 def _rows(run: Mapping[str, Any]) -> dict[str, str]:
@@ -128,5 +104,5 @@ def _summary(contents: Mapping[str, Any]) -> str:
     accuracy = contents["evaluation"] and contents["evaluation"]["all"]["accuracy"]
     if accuracy is not None:
         rows["intervals that contain the truth"] = f"{100 * accuracy:.1f} % of the valid pixels with a truth"
-    rows |= contents["surface"] or {}
+    rows |= contents["surface"]["figures"] if contents["surface"] else {}
     return "".join(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in rows.items())

@@ -30,7 +30,14 @@ function showVerdict() {
 function showSurface() {
   if (!contents.surface) return;
   find("surface").hidden = false;
-  find("surface").append(table(["", ""], Object.entries(contents.surface)));
+  const { figures, maps } = contents.surface;
+  const map = ({ title, png, ramp, ends }) => element("figure", {},
+    element("img", { class: "relief", alt: title, src: `data:image/png;base64,${png}` }),
+    element("figcaption", {}, title),
+    ...(ramp.length ? [element("div", { class: "bar", style: `background: linear-gradient(to right, ${ramp})` })] : []),
+    element("div", { class: "ends" }, ...ends.map((end) => element("span", {}, end))),
+  );
+  find("surface").append(table(["", ""], Object.entries(figures)), element("div", { class: "pair" }, ...maps.map(map)));
 }
 
 /** Draw histograms of two classes of pixels on a logarithmic axis, with a table of their counts. */
