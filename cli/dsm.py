@@ -210,3 +210,5 @@ def dsm(
     printing.say(report)
     say_surface(console, report)
     console.say(str(output))
+    if ortho:
+        console.say(str(output.with_name("ortho.tif")))

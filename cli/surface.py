@@ -80,5 +80,5 @@ def surface(
     else:
         console.summary(done["run"], out)
         say_surface(console, done["surface"])
-        console.say(str(out / "dsm.tif"))
+        console.say("\n".join(str(out / name) for name in ("dsm.tif", "ortho.tif")[: 1 + ortho]))
     run.check_strict(done["warnings"])

@@ -17,11 +17,12 @@ MINIMUM, MAXIMUM = -20, 10
 FINISHED = "2026-11-21T12:00:00+00:00"
 
 
-def write_run(folder, bands, validity, truth=None, image=None, place=PLACE):
+def write_run(folder, bands, validity, truth=None, image=None, place=None):
     """Write a run of ``bands`` ``(4, rows, columns)``, with its images and, where given, the truth beside them.
 
     Returns the folder of the run, inside ``folder``.
     """
+    place = place or PLACE
     if image is None:
         image = np.random.default_rng(0).integers(100, 1000, validity.shape)
     inputs = {"left": folder / "left.tif", "right": folder / "right.tif"}
