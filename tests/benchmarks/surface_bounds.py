@@ -159,7 +159,7 @@ def compare_bounds(scenes):
     table = Table("bounds")
     for kind, ratio, cell in scenes:
         for bounds in BOUNDS:
-            sample, walls, _ = cells_of(kind, ratio, cell, 1, bounds)
+            sample, walls = cells_of(kind, ratio, cell, 1, bounds)
             table.add(kind, ratio, cell, bounds, figures(sample, walls, 0.5 / ratio))
     table.end()
 
