@@ -54,7 +54,7 @@ ablation: $(VENV)/.has-test
 tune: $(VENV)/.has-mccnn
 	$(BIN)/python -W ignore tests/benchmarks/tune.py $(NAMES)
 
-# The built-in calibrations, on the pairs of SAT_INTERVALS_SHARED; ten minutes of processor time.
+# The built-in calibrations, on the pairs of SAT_INTERVALS_SHARED; a quarter of an hour of processor time.
 calibration: $(VENV)/.has-mccnn
 	$(BIN)/python tests/benchmarks/calibrations.py
 

@@ -6,8 +6,8 @@ implementation Pandora, with penalties 8 and 32. The baseline scales each cost c
 """
 
 import numpy as np
-from calibrations import DATA, search_of
-from coverage_tables import header, read, row
+from calibrations import DATA, read, search_of
+from coverage_tables import header, row
 from volumes import volume_of
 
 from sat_intervals import load_config, match_arrays

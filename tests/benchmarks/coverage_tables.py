@@ -12,11 +12,10 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import rasterio
-from calibrations import DATA, DEVELOPMENT, WORLDVIEW, group_of, measured, search_of, tolerance_of
+from calibrations import DATA, DEVELOPMENT, PAIRED, WORLDVIEW, group_of, measured, noisy, read, search_of, tolerance_of
 
 from sat_intervals import load_config, match_arrays
-from sat_intervals.config import PRESETS, Calibration
+from sat_intervals.config import Calibration
 from sat_intervals.kernels.confidence import low_confidence, surroundings
 from sat_intervals.products import INVALID
 from sat_intervals.run.calibrate import calibration_from
@@ -26,23 +25,6 @@ COVERAGES = 0.5, 0.8, 0.9, 0.95, 0.99
 CLASSES = "smooth", "edge", "low"
 WIDTHS = *(f"width of {name}" for name in CLASSES), "mean width", "median width"
 FIGURES = "coverage", "lowest", *CLASSES, *WIDTHS, "score", "90 % error of smooth"
-
-
-def read(scene: str, name: str) -> np.ma.MaskedArray:
-    """Read an image of a pair; no data is masked."""
-    with rasterio.open(DATA / scene / f"{name}.tif") as file:
-        return np.ma.masked_array(file.read(1), file.dataset_mask() == 0)
-
-
-def noisy(image: np.ma.MaskedArray, share: float, seed: int) -> np.ma.MaskedArray:
-    """Add white noise of a share of the deviation of an image from its means over 5 x 5 pixels."""
-    if not share:
-        return image
-    filled = image.astype(np.float32).filled(np.ma.median(image))
-    means = np.lib.stride_tricks.sliding_window_view(np.pad(filled, 2, "edge"), (5, 5)).mean(axis=(2, 3))
-    rough = (filled - means)[~np.ma.getmaskarray(image)].std()
-    noise = np.random.default_rng(seed).normal(0, share * rough, filled.shape).astype(np.float32)
-    return np.ma.masked_array(filled + noise, image.mask)
 
 
 def judged(scene: str, preset: str, interval: dict[str, Any], coverage: float, noise: float = 0) -> dict[str, float]:
@@ -106,7 +88,7 @@ def development() -> None:
     """Means over twelve scenes, one group left out at a time."""
     header("preset", "asked for", *FIGURES)
     labels = ["alpha 0.9", *(f"coverage {coverage:g}" for coverage in COVERAGES)]
-    for preset in PRESETS:
+    for preset in PAIRED:
         found = zip(*(intervals_of(scene, preset) for scene in DEVELOPMENT), strict=True)
         for label, scenes in zip(labels, found, strict=True):
             means = {name: float(np.mean([scene[name] for scene in scenes])) for name in FIGURES}

@@ -9,11 +9,10 @@ presets, or penalties to compare them with: ``make tune NAMES="satellite 'census
 import sys
 
 import numpy as np
-from calibrations import MIDDLEBURY, SYNTHETIC, WORLDVIEW, search_of, settings_of, tolerance_of
-from coverage_tables import header, read, row, without
+from calibrations import MIDDLEBURY, PAIRED, SYNTHETIC, WORLDVIEW, read, search_of, settings_of, tolerance_of
+from coverage_tables import header, row, without
 
 from sat_intervals import load_config, match_arrays
-from sat_intervals.config import PRESETS
 
 NOMINAL = 0.9
 KINDS = {"WorldView-3": WORLDVIEW, "synthetic cities": SYNTHETIC, "Middlebury": MIDDLEBURY}
@@ -49,7 +48,7 @@ def judged(scene: str, preset: str) -> dict[str, float]:
 def main() -> None:
     """Print the means over the scenes of each kind."""
     is_first = True
-    for preset in sys.argv[1:] or PRESETS:
+    for preset in sys.argv[1:] or PAIRED:
         for kind, scenes in KINDS.items():
             found = [judged(scene, preset) for scene in scenes]
             if is_first:
