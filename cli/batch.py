@@ -22,10 +22,10 @@ def batch(pairs: Path, out: Path, settings: SettingsArguments, run: RunArguments
     Columns: name, left, right, minimum, maximum, left_mask, right_mask, nodata, band, window, and any setting such as
     sgm.p2. Rows with resolution also produce a surface model, as `surface` does: of raw images with RPC models, or of
     an epipolar pair with left_model, right_model, left_grid, right_grid; further columns crs, radius, geoid, dem,
-    altitude, resolution_of, height_calibration, ortho. Rows with images, names or patterns separated by spaces, in
-    place of left and right make the surface of them, of three and more all at once; further columns crs, geoid, extent,
-    heights, ortho, height_calibration. A failed pair does not stop the others. OUT/batch.json has the state of each
-    pair; the exit status is 1 if any failed.
+    altitude, resolution_of, height_calibration, ortho, fill (metres), flatten, mask. Rows with images, names or
+    patterns separated by spaces, in place of left and right make the surface of them, of three and more all at once;
+    further columns crs, geoid, extent, heights, ortho, height_calibration, fill, flatten, mask. A failed pair does not
+    stop the others. OUT/batch.json has the state of each pair; the exit status is 1 if any failed.
     """
     from sat_intervals.config.batch import REPORT, read_batch
     from sat_intervals.heights.geometry import geometry_warnings

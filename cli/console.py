@@ -32,6 +32,7 @@ STAGES = {
     "geometry": "reading models and grids",
     "resampling": "resampling rows",
     "cells": "filling rows of cells",
+    "fill": "filling voids",
     "change": "comparing rows of cells",
     "registration": "registering the reference",
     "reference": "reading points",
@@ -161,6 +162,7 @@ class Console:
         table.add_row("median half width", "none" if width is None else f"+-{width * swept['step'] / 2:.2f} m")
         table.add_row("time", f"{report['seconds']['total']:.1f} s")
         self._terminal.print(table)
+        say_completed(self, swept.get("completed"))
         warn(report["warnings"])
         for name in ("dsm.tif", "validity.tif", "run.json"):
             self.say(str(out / name))
@@ -184,6 +186,16 @@ class Console:
             table.add_row(*row, str(len(end.get("warnings", ()))) if counts else "")
         self._terminal.print(table)
         warn(f"{name}: {line}" for name, end in report.items() for line in end.get("warnings", ()))
+
+
+def say_completed(console: Console, completed: dict[str, Any] | None) -> None:
+    """Print how many cells of a surface were filled, flattened and masked."""
+    if completed is None:
+        return
+    names = {"filled": "filled from their rims", "flattened": "of one height", "masked": "masked", "voids": "voids"}
+    console.say("cells " + ", ".join(f"{what}: {completed[name]}" for name, what in names.items()))
+    if completed["without_rim"]:
+        warn([f"{completed['without_rim']} of {completed['areas']} areas of --flatten have no heights around: no data"])
 
 
 def lines_of_grid(swept: dict[str, Any]) -> dict[str, str]:

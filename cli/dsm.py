@@ -60,6 +60,17 @@ _CELL_OPTIONS = (
     options.expert_option(
         "--min-confidence", type=float, metavar="C", help="Leave out cells of lower confidence, 0 to 1."
     ),
+    click.option("--fill", "fills", is_flag=True, help="Fill voids, from the lower of their rims beside buildings."),
+    click.option(
+        "--fill-distance",
+        type=float,
+        metavar="METRES",
+        default=20.0,
+        show_default=True,
+        help="With --fill: reach from a void to its rim.",
+    ),
+    click.option("--flatten", type=options.FILE, help="Polygons or a raster, not 0 inside: areas of one height."),
+    click.option("--mask", type=options.FILE, help="Polygons or a raster, not 0 inside: areas of no data."),
 )
 
 
@@ -81,8 +92,10 @@ def cell_options(command: options.Command) -> options.Command:
 
     @wraps(command)
     def with_cells(**given: Any) -> Any:
-        names = ("bounds", "keeps_open", "keeps_border", "outliers", "max_width", "min_confidence")
+        names = ("bounds", "keeps_open", "keeps_border", "outliers", "max_width", "min_confidence", "flatten", "mask")
         choices = {name: given.pop(name) for name in names}
+        distance = given.pop("fill_distance")
+        choices["fill"] = distance if given.pop("fills") else None
         calibration = given.pop("height_calibration")
         cells = {name: given.pop(name) for name in ("resolution", "crs", "radius", "geoid")}
         cells["resolution"] = side_of(cells["resolution"], given.pop("grid_like"))
@@ -113,6 +126,7 @@ ortho_option = click.option(
 
 def say_surface(console: "Console", report: dict[str, Any]) -> None:
     """Print what a surface has: cells, filled share, half widths, and what was left out."""
+    from sat_intervals.cli.console import say_completed
     from sat_intervals.heights.cells import WIDE
 
     say_geometry(console, report["geometry"])
@@ -134,6 +148,7 @@ def say_surface(console: "Console", report: dict[str, Any]) -> None:
     ):
         if report[name]:
             console.say(f"{report[name]} {what}")
+    say_completed(console, report["completed"])
     for found in report["shifts"]:
         shift = ", ".join(
             f"{axis} {value:+.2f} m" + (" (unknown)" if deviation is None else f" (standard deviation {deviation:.2g})")
@@ -189,6 +204,8 @@ def dsm(
     Bands: height, height_lower, height_upper, count, confidence, agreement. Heights refer to the WGS 84 ellipsoid
     unless --geoid is given. A point contributes to its cell and to cells whose centre is within --radius. Other cells
     are no data.
+
+    --fill fills voids inside the surface, --flatten gives areas such as lakes one height: count is 0 there.
 
     Several OUT are moved onto each other first: models of their images differ by a pixel or so. Where they overlap,
     heights and intervals are averaged, narrow ones with the most weight. Heights more than two cells apart are not:

@@ -44,6 +44,8 @@ def surface(
     Three raw images and more are compared at heights above the ground, all at once (preset many), and their models are
     shifted to fit each other: the more images, the more accurate.
 
+    --fill fills voids inside the surface, --flatten gives areas such as lakes one height: count is 0 there.
+
     To resume, rerun the same command: what is finished with these images and settings is kept.
     """
     from sat_intervals.errors import check_absent

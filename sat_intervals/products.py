@@ -184,7 +184,7 @@ SURFACE = (
     Band("height", "m", "mean of the points that reach the cell, the nearer the heavier"),
     Band("height_lower", "m", "lower bound of the height"),
     Band("height_upper", "m", "upper bound of the height"),
-    Band("count", "1", "points that reach the cell"),
+    Band("count", "1", "points that reach the cell; 0 where it was filled or flattened"),
     Band("confidence", "1", "mean of their confidences, 0 to 1, high = easy to match"),
     Band("agreement", "1", "1 where the intervals of several pairs meet, 0 where they do not; no data for one pair"),
 )
@@ -204,7 +204,7 @@ CHANGE = (
 # The same of many images that were compared at heights.
 _OF_SWEEP = {
     "height": "height at which the images are most alike",
-    "count": "images that see the cell",
+    "count": "images that see the cell; 0 where it was filled or flattened",
     "confidence": BANDS[3].meaning,
     "agreement": "no data",
 }

@@ -734,3 +734,46 @@ def settings_of(scene, alpha="0.9", eta_max="0.7", eta_step="0.01", refine=True,
 def halves(shape, least=-16, most=16):
     """Hypothesis float32 images of halves of integers, whose values often tie."""
     return hnp.arrays(np.float32, shape, elements=st.integers(least, most).map(lambda value: value / 2))
+
+
+# ---- Voids of surfaces (section 23) --------------------------------------------------------------------------
+def rim_of(height, i, j, reach):
+    """The first known cells from a cell in 16 directions, and known ones twice as far: rows and columns."""
+    turn = math.sqrt(2) - 1
+    first = (0, 1), (1, 0), (1, 1), (turn, 1), (1, turn)
+    steps = {(a * m, b * n) for m in (-1, 1) for n in (-1, 1) for a, b in first}
+    found, behind = [], []
+
+    def is_known(row, column):
+        return 0 <= row < height.shape[0] and 0 <= column < height.shape[1] and not np.isnan(height[row, column])
+
+    for down, across in steps:
+        for step in range(1, math.floor(reach / math.hypot(down, across)) + 1):
+            cell, far = ([math.floor(i + m * down + 0.5), math.floor(j + m * across + 0.5)] for m in (step, 2 * step))
+            if is_known(*cell):
+                found.append(cell)
+                behind += [far] * is_known(*far)
+                break
+    return found, behind
+
+
+def filled(height, lower, upper, voids, reach, apart):
+    result = np.full((3, *height.shape), np.nan)
+    for i, j in zip(*np.nonzero(voids), strict=True):
+        rim, behind = rim_of(height, i, j, reach)
+        if len(rim) < 10:
+            continue
+        both = tuple(np.transpose(rim + behind))
+        y, x = both[0] - i, both[1] - j
+        root = 1 / np.hypot(x, y)  # of the weights
+        terms = np.stack([np.ones(len(x)), x, y], axis=1)
+        plane = np.linalg.lstsq(terms * root[:, None], height[both] * root, rcond=None)[0]
+        is_smooth = np.abs(height[both] - terms @ plane).max() <= apart
+        at = tuple(np.transpose(rim))
+        z = height[at]
+        two = np.argsort(z)[:2]
+        value = plane[0] if is_smooth else z[two[1]]
+        above = np.mean((upper[at] - z)[two])
+        top = value + max(above, 0 if is_smooth else 0.75 * (z.max() - value))
+        result[:, i, j] = value, value - np.mean((z - lower[at])[two]), top
+    return result

@@ -25,7 +25,7 @@ _RESERVED = (REPORT, "logs")
 _LONGEST_NAME = 200
 _SENSORS = ("left_model", "right_model", "left_grid", "right_grid")
 _COLUMNS = ("name", "left", "right", "images", "minimum", "maximum", "window", "resolution")
-_PATHS = ("left_mask", "right_mask", *_SENSORS, "geoid", "dem", "height_calibration")
+_PATHS = ("left_mask", "right_mask", *_SENSORS, "geoid", "dem", "height_calibration", "flatten", "mask")
 # Numbers, or text with them.
 _SPLIT = BeforeValidator(lambda value: value.split() if isinstance(value, str) else value)
 _WINDOW = Annotated[tuple[int, int, int, int], _SPLIT]
@@ -64,6 +64,9 @@ class SurfaceOptions(TypedDict, total=False):
     extent: _EXTENT
     heights: Annotated[tuple[float, float], _SPLIT]
     ortho: bool
+    fill: float
+    flatten: Path
+    mask: Path
 
 
 @dataclass(frozen=True)

@@ -11,14 +11,12 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.evaluate.change import Pair
-from sat_intervals.heights.polygons import read_polygons
+from sat_intervals.heights.polygons import read_areas
 from sat_intervals.kernels.change import connected, painted
 from sat_intervals.kernels.significance import ratio_of
-from sat_intervals.raster import read_heights
-from sat_intervals.raster.polygons import Polygon, burned, outline
+from sat_intervals.raster.polygons import Polygon, outline
 from sat_intervals.tiling import Window
 
-_VECTORS = ".gpkg", ".geojson", ".json", ".shp", ".fgb", ".parquet"
 # Probability without a change up to which cells beside an area belong to it: half as many cells again of blocks of 7 to
 # 10 m, and on unchanged ground at most .008 of the cells in areas at a rate of .01, as many areas as without.
 _LIKELY = 0.2
@@ -29,13 +27,11 @@ Chosen = Callable[[Window], np.ndarray]
 
 def stable_ground(path: Path | None, pair: Pair) -> Chosen:
     """Open a raster that is not 0 on stable ground, or polygons of it; None is no ground."""
-    place, shape = pair.before.place, pair.before.shape
+    place = pair.before.place
     if path is None:
         return lambda window: np.zeros((window.height, window.width), bool)
-    if path.suffix.lower() in _VECTORS:
-        crs, polygons = read_polygons(path)
-        return lambda window: burned(polygons, crs, place.shifted(window), (window.height, window.width))
-    return lambda window: np.nan_to_num(read_heights(path, place, shape, window)) != 0
+    areas = read_areas(path).on(place, pair.before.shape)
+    return lambda window: areas.numbers(place.shifted(window), (window.height, window.width)) > 0
 
 
 def signs_of(pair: Pair, false_alarms: float, stable: Chosen) -> tuple[np.ndarray, dict[str, int]]:

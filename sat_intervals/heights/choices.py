@@ -7,6 +7,8 @@ from typing import Literal, get_args
 
 from sat_intervals.config import HeightCalibration, Interval
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.heights.polygons import read_areas
+from sat_intervals.raster.completion import Completion
 
 Bounds = Literal["envelope", "median"]
 BOUNDS: tuple[Bounds, ...] = get_args(Bounds)
@@ -36,6 +38,11 @@ class SurfaceChoices:
         run is moved onto.
     ortho
         Whether the raw left image of the first run, resampled to the surface, is written beside it as ``ortho.tif``.
+    fill
+        Metres up to which voids are filled from their rims. None: voids are no data.
+    flatten, mask
+        Polygons, or a raster that is not 0 inside: areas of one height, that of a low part of their rims, and areas of
+        no data.
     """
 
     bounds: Bounds | None = None
@@ -48,13 +55,16 @@ class SurfaceChoices:
     aligns: bool = True
     reference: Path | None = None
     ortho: bool = False
+    fill: float | None = None
+    flatten: Path | None = None
+    mask: Path | None = None
 
     def __post_init__(self) -> None:
         if self.bounds is not None and self.bounds not in BOUNDS:
             raise SatIntervalsError(f"bounds is {self.bounds!r}, allowed: {', '.join(BOUNDS)}")
         if self.reference and not self.aligns:
             raise SatIntervalsError("runs are moved onto a reference: leave it out, or let them be aligned")
-        for name, value in (("outliers", self.outliers), ("max_width", self.max_width)):
+        for name, value in (("outliers", self.outliers), ("max_width", self.max_width), ("fill", self.fill)):
             if value is not None and not 0 < value < float("inf"):
                 raise SatIntervalsError(f"{name} is {value:g} m: give one above 0, or leave it out")
         if self.min_confidence is not None and not 0 <= self.min_confidence <= 1:
@@ -75,3 +85,12 @@ class SurfaceChoices:
         limits |= {"MIN_CONFIDENCE": (self.min_confidence, "")}
         tags = {name: f"{value:g}{unit}" for name, (value, unit) in limits.items() if value is not None}
         return {"INTERVAL": str(self.bounds), **tags, **({} if self.keeps_open else {"OPEN_POINTS": "left out"})}
+
+
+def completion_of(cell: float, fill: float | None, flatten: Path | None, mask: Path | None) -> Completion | None:
+    """Read what completes a surface with cells of a side in metres; None if it stays as it was measured."""
+    if not (fill or flatten or mask):
+        return None
+    completion = Completion.of(fill, *(read_areas(path) if path else None for path in (flatten, mask)))
+    completion.check(cell)
+    return completion

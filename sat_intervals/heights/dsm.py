@@ -11,7 +11,7 @@ from sat_intervals.config import Calibration, Interval
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.alignment import aligned
 from sat_intervals.heights.cells import CellCounts, Strip, strips
-from sat_intervals.heights.choices import SurfaceChoices
+from sat_intervals.heights.choices import SurfaceChoices, completion_of
 from sat_intervals.heights.geometry import FILE, Geometry, geometry_of
 from sat_intervals.heights.lattice import Ground, joined, on_map
 from sat_intervals.heights.ortho import write_ortho_of
@@ -21,6 +21,7 @@ from sat_intervals.machine import usable_cores
 from sat_intervals.products import ORTHO
 from sat_intervals.progress import Progress
 from sat_intervals.raster import OutputWriter, Projection, files_of, north_up, read_place, surface_file, utm_of
+from sat_intervals.raster.completion import Completion, complete
 from sat_intervals.raster.georeferencing import horizontal_name
 from sat_intervals.raster.heightfield import warn_of_no_data
 from sat_intervals.raster.identity import check_not_replaced, identities
@@ -69,13 +70,16 @@ def make_surface(
 
     Returns
     -------
-    ``crs``, ``rows``, ``columns``, ``points``, ``filled`` (share of cells with a height), ``disagreeing`` (share of the
-    cells of several runs whose intervals do not overlap, None if there are none), ``shifts`` (of each run in metres,
-    with its standard deviation, None if unknown; empty if nothing was aligned), ``without_intervals`` (folders of
-    runs without intervals); ``bounds``; ``calibration`` (its name, None without one); ``median_half_width`` (metres)
-    and ``wide``, the share of cells with bounds whose half width exceeds 20 m, both None without bounds; ``outliers``,
-    ``open``, ``border`` and ``poor_cells``, the numbers of points and cells left out; ``geometry``, for each folder,
-    how models and grids fit, see `set_geometry`, and ``lost``, the share of the region where they have no values.
+    ``crs``, ``rows``, ``columns``, ``points``, ``filled`` (share of cells with a measured height), ``disagreeing``
+    (share of the cells of several runs whose intervals do not overlap, None if there are none), ``shifts`` (of each run
+    in metres, with its standard deviation, None if unknown; empty if nothing was aligned), ``without_intervals``
+    (folders of runs without intervals); ``bounds``; ``calibration`` (its name, None without one);
+    ``median_half_width`` (metres) and ``wide``, the share of cells with bounds whose half width exceeds 20 m, both None
+    without bounds; ``outliers``, ``open``, ``border`` and ``poor_cells``, the numbers of points and cells left out;
+    ``completed``, numbers of cells ``filled``, ``flattened``, ``masked``, and ``voids`` that stay, of ``areas`` of one
+    height, and of those ``without_rim``, which are voids, None of a surface as it was measured; ``geometry``, for each
+    folder, how models and grids fit, see `set_geometry`, and ``lost``, the share of the region where they have no
+    values.
 
     Raises
     ------
@@ -83,10 +87,10 @@ def make_surface(
         A run has no models and grids, or none that fit, no cell has a height, the CRS or the grid cannot be used, or
         the file cannot be written.
     """
-    path, geoid = Path(path), None if geoid is None else Path(geoid)
-    choices = choices or SurfaceChoices()
-    given = [geoid, *_files_of(choices.reference), *_files_of(resolution)]
+    path, geoid, choices = Path(path), None if geoid is None else Path(geoid), choices or SurfaceChoices()
+    given = [geoid, choices.flatten, choices.mask, *_files_of(choices.reference), *_files_of(resolution)]
     grid, resolution, crs, radius = checked_cells(resolution, crs, radius, geoid)
+    completion = completion_of(resolution, choices.fill, choices.flatten, choices.mask)
     level = f"above {geoid or 'the WGS 84 ellipsoid'}"
     _check_reference(choices.reference, path, level)
     geometries = _geometries(outs, [path, path.with_name(ORTHO)][: 1 + choices.ortho], given, progress)
@@ -99,17 +103,16 @@ def make_surface(
     projection = Projection(crs or utm_of(*middle), geoid)
     projection.check(*middle)
     clouds = [PointCloud(one.run, on_map(one.lattice, projection, str(one.run.out)), choices) for one in geometries]
-    crs = projection.crs
     with ThreadPoolExecutor(usable_cores()) as threads:
         cells, shifts = _cells(threads, clouds, resolution, radius, grid), list[dict[str, Any]]()
         if choices.reference or (choices.aligns and len(clouds) > 1):
-            clouds, shifts = aligned(threads, clouds, cells, crs, radius, choices.reference)
+            clouds, shifts = aligned(threads, clouds, cells, projection.crs, radius, choices.reference)
             cells = _cells(threads, clouds, resolution, radius, grid)
-        tally = _write(path, strips(threads, clouds, cells, radius, choices), cells, crs, tags, progress)
+        parts = strips(threads, clouds, cells, radius, choices)
+        figures = _write(path, parts, cells, projection.crs, tags, completion, progress)
     if choices.ortho:
         write_ortho_of(runs[0], path, projection, shifts[0]["shift"] if shifts else (0, 0, 0), progress)
-    figures = tally.report(cells.rows * cells.columns)
-    return {"crs": crs, "rows": cells.rows, "columns": cells.columns, **figures} | {
+    return {"crs": projection.crs, "rows": cells.rows, "columns": cells.columns, **figures} | {
         "bounds": choices.bounds,
         "calibration": choices.calibration and choices.calibration.name,
         "shifts": shifts,
@@ -132,19 +135,29 @@ def _files_of(raster: float | Path | None) -> Sequence[str]:
 
 
 def _write(
-    path: Path, parts: Iterable[Strip], cells: Cells, crs: str, tags: dict[str, str], progress: Progress
-) -> CellCounts:
-    """Write the strips of a surface; return what they have."""
+    path: Path,
+    parts: Iterable[Strip],
+    cells: Cells,
+    crs: str,
+    tags: dict[str, str],
+    completion: Completion | None,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Write the strips of a surface and complete it; return what cells have, and the numbers of `complete`."""
     tally, place = CellCounts(), north_up(crs, cells.left, cells.top, cells.resolution)
-    with OutputWriter(path.parent, [surface_file(path.name)], cells.rows, cells.columns, place, tags) as writer:
+    file, completed = surface_file(path.name), None
+    tags |= completion.tags() if completion else {}
+    with OutputWriter(path.parent, [file], cells.rows, cells.columns, place, tags) as writer:
         for row, bands, counts in parts:
             tally.add(bands, counts)
             writer.write(row, bands)
             progress("cells", row + bands.shape[1], cells.rows)
         progress("files", 0, 1)
+        if completion:
+            completed = complete(writer.build()[file.name], file, place, tags, completion, progress)
         writer.publish()
         progress("files", 1, 1)
-    return tally
+    return tally.report(cells.rows * cells.columns) | {"completed": completed}
 
 
 def _geometries(

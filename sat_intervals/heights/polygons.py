@@ -1,4 +1,4 @@
-"""Read and write files of polygons with pyogrio: GeoPackage, GeoJSON, shapefiles."""
+"""Read areas of the map from rasters and polygons, and write polygons; pyogrio has GeoPackage, GeoJSON, shapefiles."""
 
 from collections.abc import Mapping, Sequence
 from io import BytesIO
@@ -6,13 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.heights.point_files import reading
 from sat_intervals.raster import Georeferencing
-from sat_intervals.raster.polygons import Polygon
+from sat_intervals.raster.polygons import Areas, Polygon
 from sat_intervals.raster.publishing import write_file
 
 _POLYGONS = 3, 6  # types of shapely
+_VECTORS = ".gpkg", ".geojson", ".json", ".shp", ".fgb", ".parquet"
 
 
 def write_polygons(
@@ -30,15 +31,18 @@ def write_polygons(
     write_file(path, content.getvalue())
 
 
-def read_polygons(path: Path) -> tuple[str, list[Polygon]]:
-    """Return the CRS of a file and its polygons."""
+def read_areas(path: Path) -> Areas:
+    """Read polygons, or a raster that is not 0 in areas."""
+    check_file(path, "give a raster or a file of polygons")
+    if path.suffix.lower() not in _VECTORS:
+        return Areas.of_raster(path)
     with reading(path, "polygons"):
         import shapely
         from pyogrio.raw import read
 
         known, _, geometry, _ = read(path, columns=[])
-        found = shapely.from_wkb(geometry)
+        found = shapely.force_2d(shapely.from_wkb(geometry))
         polygons = [shapely.geometry.mapping(one) for one in found[np.isin(shapely.get_type_id(found), _POLYGONS)]]
     if not known["crs"]:
         raise SatIntervalsError(f"{path} has no CRS: declare it, such as with ogr2ogr -a_srs EPSG:32637")
-    return known["crs"], polygons
+    return Areas.of(path, known["crs"], polygons)

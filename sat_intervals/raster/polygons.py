@@ -1,15 +1,20 @@
 """Turn cells into polygons and polygons into cells."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rasterio.features import rasterize, shapes
+from rasterio.features import bounds, rasterize, shapes
+from rasterio.transform import array_bounds
 from rasterio.warp import transform_geom
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
+from sat_intervals.raster.images import opened
+from sat_intervals.raster.surfaces import read_place
 
 Polygon = Mapping[str, Any]
 """A polygon as GeoJSON has it."""
@@ -21,12 +26,52 @@ def outline(inside: np.ndarray, place: Georeferencing) -> Polygon:
     return found
 
 
-def burned(polygons: Sequence[Polygon], crs: str, place: Georeferencing, shape: tuple[int, int]) -> np.ndarray:
-    """Return which cells have their centre in one of some polygons of a CRS."""
-    try:
-        moved = transform_geom(crs, place.crs, polygons)
-    except gdal.GDAL_ERRORS as error:
-        raise SatIntervalsError(
-            f"polygons of {crs[:40]} are not on the map of the surface: {gdal.reason(error)}"
-        ) from error
-    return np.asarray(rasterize(moved, shape, transform=place.affine, dtype=np.uint8)) > 0
+@dataclass(frozen=True)
+class Areas:
+    """Polygons of a file on a map, and their extents there, ``(n, 4)``: left, bottom, right, top."""
+
+    path: Path
+    crs: str
+    polygons: Sequence[Polygon]
+    extents: np.ndarray
+
+    @classmethod
+    def of(cls, path: Path, crs: str, polygons: Sequence[Polygon]) -> "Areas":
+        """Return the areas of polygons in a CRS."""
+        extents = np.array([bounds(one) for one in polygons]).reshape(-1, 4)
+        return cls(path, crs, polygons, extents)
+
+    @classmethod
+    def of_raster(cls, path: Path) -> "Areas":
+        """Return the areas of a raster that is not 0 inside: cells that touch along rows or columns are one."""
+        _, place = read_place(path)
+        with opened(str(path)) as dataset:
+            values = dataset.read(1)
+            inside = (dataset.read_masks(1) != 0) & (values != 0) & ~np.isnan(values)
+        found = shapes(inside.astype(np.uint8), inside, transform=place.affine)
+        assert place.crs is not None
+        return cls.of(path, place.crs.to_wkt(), [one for one, _ in found])
+
+    def on(self, place: Georeferencing, shape: tuple[int, int]) -> "Areas":
+        """Return the areas that are on a surface, on its map."""
+        assert place.crs is not None
+        crs = place.crs.to_wkt()
+        try:
+            moved = Areas.of(self.path, crs, transform_geom(self.crs, crs, self.polygons) if self.polygons else [])
+        except gdal.GDAL_ERRORS as error:
+            raise SatIntervalsError(f"{self.path} is not on the map of the surface: {gdal.reason(error)}") from error
+        near = moved._near(place, shape)
+        return replace(moved, polygons=[moved.polygons[one] for one in near], extents=moved.extents[near])
+
+    def _near(self, place: Georeferencing, shape: tuple[int, int]) -> list[int]:
+        """Return the indices of the areas whose extents meet that of some cells."""
+        left, bottom, right, top = array_bounds(*shape, place.affine)
+        wests, souths, easts, norths = self.extents.T
+        return np.flatnonzero((wests < right) & (left < easts) & (souths < top) & (bottom < norths)).tolist()
+
+    def numbers(self, place: Georeferencing, shape: tuple[int, int]) -> np.ndarray:
+        """Return the number of the area, from 1, that has the centre of each cell, 0 of none; the last one counts."""
+        numbered = [(self.polygons[one], one + 1) for one in self._near(place, shape)]
+        if not numbered:
+            return np.zeros(shape, np.int32)
+        return np.asarray(rasterize(numbered, shape, transform=place.affine, dtype=np.int32))

@@ -16,6 +16,7 @@ from sat_intervals.match.postprocess import ConfidenceScale, confidence_scale
 from sat_intervals.products import as_json
 from sat_intervals.progress import Progress, logged_stage
 from sat_intervals.raster import OutputError, OutputWriter, Part
+from sat_intervals.raster.completion import complete
 from sat_intervals.raster.identity import absolute_in
 from sat_intervals.raster.publishing import new_file
 from sat_intervals.run.inputs import check_unchanged
@@ -54,10 +55,15 @@ def assemble(job: Job, workers: Workers, seconds: dict[str, float], progress: Pr
     ):
         with logged_stage(seconds, "files"):
             _copy_parts(job, writer, parts, workers, progress)
-            made = writer.build()
+            made, completed = writer.build(), None
+            if job.swept and job.swept.completion:
+                surface = made[files[0].name]
+                completed = complete(surface, files[0], place, tags_of(job), job.swept.completion, progress)
         with logged_stage(seconds, "inputs"):
             check_unchanged(absolute_in(job.out, job.inputs), job.images, job.config)
         report = report_of(job, tables, scale, parts.values(), seconds)
+        if completed:
+            report["sweep"]["completed"] = completed
         for line in report["warnings"]:
             _WARNINGS.warning("%s", line)
         _publish(job, writer, made, report)

@@ -20,6 +20,7 @@ from sat_intervals.prepare.pair import Each, FilePair, here
 from sat_intervals.prepare.prepared import Prepared, prepare
 from sat_intervals.products import plain
 from sat_intervals.raster import Image, check_space, files_of
+from sat_intervals.raster.completion import Completion
 from sat_intervals.raster.identity import absolute_in, check_not_replaced, identities, relative_in
 from sat_intervals.run.checks import check_tiles, checked_pair, checked_region, disk_bytes, fitted_to_jobs
 from sat_intervals.run.inputs import describe_inputs
@@ -43,7 +44,8 @@ class Swept:
 
     images: by the names of their records.
     asked: digest of all that its geometry was found from.
-    level: what its heights are above, in words; ``calibration``: margins that move their bounds.
+    level: what its heights are above, in words; ``calibration``: margins that move their bounds; ``completion``: what
+        is done to the measured surface.
     report: shifts and other figures, for ``run.json``.
     """
 
@@ -52,6 +54,7 @@ class Swept:
     level: str
     report: dict[str, Any]
     calibration: HeightCalibration | None = None
+    completion: Completion | None = None
 
 
 @dataclass(frozen=True)
@@ -118,8 +121,7 @@ class Job:
     @property
     def name(self) -> str:
         """Return the name of the run: a digest of all that decides the bytes of its files."""
-        margins = {"margins": self.swept.calibration.sha256} if self.swept and self.swept.calibration else {}
-        return digest(self.manifest | {"all": self.settings} | margins)
+        return digest(self.manifest | {"all": self.settings, "asked": self.swept and self.swept.report["request"]})
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -178,9 +180,8 @@ class Job:
             return self.prepared.ranges
         kept = (self.store.meta(ONCE, _RANGE, origin_of(self.inputs)) or {}).get("ranges")
         if kept is None or digest(kept) != self.manifest["local_ranges"]:
-            raise DamagedTilesError(
-                f"the local search ranges in {self.store.folder} are missing: rerun the same command: it resumes"
-            )
+            where = f"the local search ranges in {self.store.folder}"
+            raise DamagedTilesError(f"{where} are missing: rerun the same command: it resumes")
         return LocalRanges.of_report(kept)
 
     def ground(self) -> GroundViews | None:
@@ -190,12 +191,13 @@ class Job:
         try:
             return _read_ground(self.store, self.swept.asked)[0]
         except DamagedFileError as error:
-            message = f"the geometry in {self.store.folder} is missing: rerun the same command: it resumes"
-            raise DamagedTilesError(message) from error
+            where = f"the geometry in {self.store.folder}"
+            raise DamagedTilesError(f"{where} is missing: rerun the same command: it resumes") from error
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out what workers read from the store, see `ranges` and `ground`, and evidence."""
-        return self.__dict__ | {"prepared": replace(self.prepared, ranges=None, search=None, survey=None, ground=None)}
+        """Leave out what workers read from the store, see `ranges` and `ground`, evidence, and areas."""
+        prepared = replace(self.prepared, ranges=None, search=None, survey=None, ground=None)
+        return self.__dict__ | {"prepared": prepared, "swept": self.swept and replace(self.swept, completion=None)}
 
     def waiting(self) -> list[Tile]:
         """Return the tiles that are not done."""
@@ -277,8 +279,7 @@ def kept_ground(out: Path, asked: str) -> tuple[GroundViews, dict[str, Any]] | N
 def _known(out: Path, before: Mapping[str, Any], inputs: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return what an earlier run of the same images has found, see `Prepared.known`."""
     if PLACE in before:
-        store = Store(place_of(home_of(out), before), _NO_TILES, "")
-        return store.meta(ONCE, _RANGE, origin_of(inputs)) or {}
+        return Store(place_of(home_of(out), before), _NO_TILES, "").meta(ONCE, _RANGE, origin_of(inputs)) or {}
     if before.get("origin") == origin_of(inputs):
         statistics = before["normalization"] and {"rows": before["rows"], **before["normalization"]}
         return {"found": before["search"], "survey": before["survey"], "statistics": statistics}

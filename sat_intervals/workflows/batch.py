@@ -6,6 +6,7 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -119,7 +120,8 @@ def _check_not_replaced(pairs: Sequence[PairOfBatch], others: Sequence[str | Pat
     """Raise if an input of any pair, or another file that is read, is an output of any pair."""
     folders = [out / pair.name for pair in pairs]
     images = [name for pair in pairs for name in (*pair.images, pair.left_mask, pair.right_mask)]
-    files = [pair.options.get(name) for pair in pairs for name in ("geoid", "dem", "height_calibration")]
+    options = "geoid", "dem", "height_calibration", "flatten", "mask"
+    files = [pair.options.get(option) for pair in pairs for option in options]
     named = [name for pair in pairs for name in (*(pair.sensors or ()), *named_files(pair.settings))]
     names = {str(name) for name in (*others, *images, *named, *files) if name}
     read = [file for name in names for file in _files(name)]
@@ -150,7 +152,7 @@ class _Surfaces:
         for pair in of_surfaces:
             try:
                 if not pair.more:
-                    check_cells(_cells(pair), SurfaceChoices(), None)
+                    check_cells(_cells(pair), replace(_choices(pair), calibration=None), None)
                 if has_grids(pair.sensors):
                     check_sensors(pair.sensors or (), _cells(pair)["resolution"], pair.options.get("crs"))
             except SatIntervalsError as error:
@@ -198,7 +200,7 @@ class _Surfaces:
                 raise self._errors[pair.name]
             out, progress = self._out / pair.name, self._how["progress"]
             if not pair.more:
-                cells = {**_cells(pair), "choices": _choices(pair)}
+                cells = _cells(pair) | {"choices": _choices(pair)}
                 return {"surface": surface_of(out, self._sensors[pair.name], progress, **cells)}
             if pair.name in self._orthos:
                 from sat_intervals.workflows.ortho import write_ortho
@@ -215,8 +217,9 @@ def _cells(pair: PairOfBatch) -> dict[str, Any]:
 
 def _choices(pair: PairOfBatch) -> SurfaceChoices:
     file = pair.options.get("height_calibration")
+    how: dict[str, Any] = {name: pair.options.get(name) for name in ("fill", "flatten", "mask")}
     margins = load_height_calibration(file) if file else None
-    return SurfaceChoices(calibration=margins, ortho=pair.options.get("ortho", False))
+    return SurfaceChoices(calibration=margins, ortho=pair.options.get("ortho", False), **how)
 
 
 def _opened(pair: PairOfBatch) -> list[Image]:

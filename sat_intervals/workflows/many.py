@@ -18,6 +18,7 @@ from sat_intervals.prepare.prepared import Prepared
 from sat_intervals.products import ORTHO, plain
 from sat_intervals.progress import Progress, logged_stage
 from sat_intervals.raster import Image, Projection, find_model, north_up, utm_of
+from sat_intervals.raster.completion import Completion
 from sat_intervals.raster.identity import check_not_replaced, identities, identity
 from sat_intervals.raster.publishing import check_free
 from sat_intervals.results import open_run
@@ -58,6 +59,9 @@ class Wanted(NamedTuple):
     models: Sequence[str | Path | None] = ()
     ortho: bool = False
     calibration: HeightCalibration | None = None
+    fill: float | None = None
+    flatten: Path | None = None
+    mask: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -71,12 +75,14 @@ class Asked:
     grid: "Cells | None"
     inputs: dict[str, Any]
     digest: str
+    completion: Completion | None
 
     @property
     def request(self) -> str:
         """Return a digest of all that is asked for."""
         calibration = self.wanted.calibration and self.wanted.calibration.sha256
-        return digest([self.digest, self.config.model_dump(mode="json", exclude={"cluster", "preset"}), calibration])
+        settings = self.config.model_dump(mode="json", exclude={"cluster", "preset"})
+        return digest([self.digest, settings, calibration, self.completion and self.completion.key])
 
 
 Geometry = tuple[GroundViews, dict[str, Any]]
@@ -113,6 +119,7 @@ def surface_of_many(
 
 def asked_of(images: Sequence[Image], out: Path, config: Config, wanted: Wanted, *, overwrite: bool = False) -> Asked:
     """Check all that can be checked before the geometry of a sweep is found."""
+    from sat_intervals.heights.choices import completion_of
     from sat_intervals.heights.dsm import checked_cells
 
     config = resolved(config)
@@ -124,6 +131,7 @@ def asked_of(images: Sequence[Image], out: Path, config: Config, wanted: Wanted,
     grid, cell, crs, _ = checked_cells(wanted.resolution, wanted.crs, None, wanted.geoid)
     if wanted.extent:
         grid = _cells_of(wanted.extent, grid, cell)
+    completion = completion_of(cell, wanted.fill, wanted.flatten, wanted.mask)
     _check_margins(wanted.calibration, config, len(images), cell)
     check_folder(out, overwrite=overwrite, names=outputs_of(config))
     named = {f"image_{number}": image for number, image in enumerate(images, start=1)}
@@ -131,7 +139,7 @@ def asked_of(images: Sequence[Image], out: Path, config: Config, wanted: Wanted,
     outputs = [*outputs_of(config), *([ORTHO] if wanted.ortho else [])]
     found = (model for one in images if (model := find_model(one.path)) != one.path)
     files = wanted.geoid, *(wanted.models or found)
-    like = [wanted.resolution] if isinstance(wanted.resolution, Path) else []
+    like = [wanted.flatten, wanted.mask, wanted.resolution if isinstance(wanted.resolution, Path) else None]
     check_not_replaced([*identities(inputs), *files, *like], [out / name for name in outputs], [home_of(out)])
     if wanted.ortho and read_report(out) is None:
         check_free(out / ORTHO, overwrite=overwrite)
@@ -142,7 +150,7 @@ def asked_of(images: Sequence[Image], out: Path, config: Config, wanted: Wanted,
         "given": [cell, grid and asdict(grid), crs, wanted.heights],
         "files": [file and identity(str(file), {}) for file in files],
     }
-    return Asked(named, config, wanted._replace(crs=crs), cell, grid, inputs, digest(plain(decisive)))
+    return Asked(named, config, wanted._replace(crs=crs), cell, grid, inputs, digest(plain(decisive)), completion)
 
 
 def _check_margins(calibration: HeightCalibration | None, config: Config, images: int, cell: float) -> None:
@@ -263,6 +271,7 @@ def geometry_job(asked: Asked, out: Path, geometry: Geometry, region: Window | N
         str(asked.wanted.geoid or "the WGS 84 ellipsoid"),
         figures | {"request": asked.request},
         asked.wanted.calibration,
+        asked.completion,
     )
     config, cells = with_range(asked.config, figures), figures["cells"]
     place = north_up(figures["crs"], cells["left"], cells["top"], cells["resolution"])

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from sat_intervals.config import Interval, load_config, resolved
 from sat_intervals.errors import SatIntervalsError, check_absent
-from sat_intervals.heights.choices import SurfaceChoices
+from sat_intervals.heights.choices import SurfaceChoices, completion_of
 from sat_intervals.heights.dsm import check_sensors, checked_cells, make_surface, surface_tags
 from sat_intervals.heights.geometry import geometry_warnings, set_geometry
 from sat_intervals.heights.rectify import IMAGES, raw_inputs, rectified_files
@@ -82,7 +82,8 @@ def surface(
         RPC models of the images; of an epipolar pair left and right model and grid, see `set_geometry`. By default the
         models that belong to raw images, and what `rectify` has noted of its pair.
     radius, choices
-        Of two images, as for `make_surface`; of more, ``choices`` may have a calibration only.
+        Of two images, as for `make_surface`; of more, ``choices`` may have ``calibration``, ``fill``, ``flatten`` and
+        ``mask``.
     dem, altitude, resolution_of
         Of two raw images, as for `rectify`; the heights of ``dem`` refer to ``geoid``.
     window
@@ -117,13 +118,14 @@ def surface(
     config, out, geoid = load_config(config, images=len(opened)), Path(out), Path(geoid) if geoid else None
     resolution = Path(resolution) if isinstance(resolution, str) else resolution
     choices, raw = choices or SurfaceChoices(), {"dem": dem, "altitude": altitude, "resolution_of": resolution_of}
-    of_points = None if replace(choices, calibration=None) == SurfaceChoices() else choices
+    of_many = choices.calibration, choices.fill, choices.flatten, choices.mask
+    of_points = replace(choices, calibration=None, fill=None, flatten=None, mask=None) != SurfaceChoices()
     if len(opened) < 2:
         raise SatIntervalsError(f"images: {len(opened)} given, a surface needs two or more")
     how: dict[str, Any] = {"overwrite": overwrite, "progress": progress}
     if len(opened) > 2:
-        check_absent(raw | {"window": window, "radius": radius, "a choice of points": of_points}, "two images")
-        wanted = Wanted(resolution, crs, geoid, extent, heights, sensors, ortho, choices.calibration)
+        check_absent(raw | {"window": window, "radius": radius, "a choice of points": of_points or None}, "two images")
+        wanted = Wanted(resolution, crs, geoid, extent, heights, sensors, ortho, *of_many)
         return surface_of_many(opened, out, config, wanted, keep_tiles=keep_tiles, **how)
     check_absent({"extent": extent, "heights": heights}, "three images or more")
     check_cost(config)
@@ -135,7 +137,8 @@ def surface(
     grid = files_of(str(resolution)) if isinstance(resolution, Path) else ()
     read = [file for one in opened for file in (one.path, one.mask)]
     results = [out / name for name in (*OUTPUTS, *FILES)]
-    check_not_replaced([*read, *pair.sensors, geoid, *grid], results, [out / "tiles"])
+    read += map(str, filter(None, (*pair.sensors, geoid, choices.flatten, choices.mask, *grid)))
+    check_not_replaced(read, results, [out / "tiles"])
     check_sensors(pair.sensors, resolution, crs)
     run = match_pair(pair.left, pair.right, out, config, window=window, keep_tiles=keep_tiles, **how)
     made = surface_of(out, pair.sensors, progress, **cells, choices=replace(choices, ortho=ortho or choices.ortho))
@@ -147,6 +150,7 @@ def surface(
 def check_cells(cells: Mapping[str, Any], choices: SurfaceChoices, interval: Interval | None) -> None:
     """Raise for cells that the surface cannot have, before hours of matching."""
     _, cell, _, radius = checked_cells(**cells)
+    completion_of(cell, choices.fill, choices.flatten, choices.mask)
     surface_tags(["run"], [interval], choices.for_intervals([interval]), cell, radius)
 
 

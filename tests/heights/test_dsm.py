@@ -12,10 +12,11 @@ import pytest
 import rasterio
 from cameras import cameras, sensor_words
 from finished import write_run
-from helpers import COMMAND, invoke, wait_until
+from helpers import COMMAND, invoke, refused, wait_until
 from numpy.testing import assert_allclose, assert_array_equal
 from pyproj import Transformer
 from rasterio.shutil import copy
+from rasterio.transform import Affine
 from surfaces import write_geoid, write_raster
 
 from sat_intervals import SatIntervalsError
@@ -79,6 +80,31 @@ def surface_of(outs, tmp_path, **options):
 def cell_of(place, x, y):
     """Row and column of the cell in which a map place falls."""
     return np.floor((y - place.f) / place.e).astype(int), np.floor((x - place.c) / place.a).astype(int)
+
+
+def test_make_surface__fills_voids_flattens_and_masks(tmp_path):
+    row, column = np.indices((40, 40))
+    height = np.where((row % 9 > 5) & (column % 9 > 5), np.nan, 50.0)
+    out = write_points(tmp_path / "a", column + 0.5, -row - 0.5, height)
+    cells = write_raster(tmp_path / "lake.tif", (row // 10 == 1)[np.newaxis], Affine(1, 0, LEFT, 0, -1, TOP))
+    plain, _, report = surface_of([out], tmp_path, radius=0.5)
+    assert report["completed"] is None
+    choices = SurfaceChoices(fill=9.0, flatten=cells, mask=cells)
+    completed = surface_of([out], tmp_path, radius=0.5, choices=choices)[2]["completed"]
+    assert {"masked": 400, "flattened": 0, "without_rim": 0}.items() <= completed.items()
+    bands, _, report = surface_of([out], tmp_path, radius=0.5, choices=SurfaceChoices(fill=9.0, flatten=cells))
+    inner = np.s_[:, 1:-5, 1:-5]
+    assert np.isnan(plain[0][inner[1:]]).any()
+    assert (bands[0][inner[1:]] == 50).all()
+    assert set(np.unique(bands[BAND["count"]][inner[1:]])) == {0, 1}
+    assert report["completed"]["flattened"] == 400
+    assert report["completed"]["filled"] > 50
+    with rasterio.open(tmp_path / "dsm.tif") as dataset:
+        assert {"FILLED": "voids up to 9 m from their rims", "FLATTENED": "lake.tif"}.items() <= dataset.tags().items()
+    result = invoke("dsm", out, "--resolution", 1, "--fill", "--fill-distance", 9, "--output", tmp_path / "new.tif")
+    assert "cells filled from their rims: " in result.stdout
+    refused(["dsm", out, "--resolution", 1, "--fill", "--fill-distance", 0], "fill is 0 m: give one above 0")
+    refused(["dsm", out, "--resolution", 1, "--mask", cells, "--output", cells], "lake.tif")
 
 
 def test_make_surface__worked_example(tmp_path):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import rasterio
 from helpers import COMMAND, invoke, refused, wait_until
+from numpy.testing import assert_array_equal
 from raw import raw_pair
 from sweeps import CRS, OPTIONS, WORDS
 
@@ -71,6 +72,32 @@ def test_surface_of_many__has_the_same_bytes_for_any_tiles_and_says_that_it_was_
     (out / "dsm.tif").unlink()
     with pytest.raises(SatIntervalsError, match=r"dsm.tif"):
         surface(sweep.images, out, settings, **OPTIONS)
+
+
+def test_surface_of_many__is_completed_the_same_in_a_batch_and_knows_with_what(sweep, tmp_path, caplog):
+    cells = sweep.report["sweep"]["cells"]
+    mask = np.zeros((cells["rows"], cells["columns"]), np.uint8)
+    mask[60:70, 60:70] = 1
+    write_layer(tmp_path / "mask.tif", mask, 255, north_up(CRS, cells["left"], cells["top"], PIXEL))
+    words = *map(str, sweep.images), tmp_path / "out", *WORDS, "--fill", "--mask", tmp_path / "mask.tif"
+    result = invoke("surface", *words, "--json")
+    assert result.exit_code == 0, result.output
+    report = json.loads(result.stdout)
+    measured, bands = (read_layers(out / "dsm.tif") for out in (sweep.out, tmp_path / "out"))
+    filled = np.isfinite(bands[0]) & np.isnan(measured[0])
+    assert filled.sum() == report["sweep"]["completed"]["filled"] > 100
+    assert np.isnan(bands[0][60:70, 60:70]).all()
+    assert_array_equal((bands[3] == 0), filled)
+    kept = np.isfinite(measured[0]) & (mask == 0)
+    assert_array_equal(bands[:, kept], measured[:, kept])
+    assert f"cells filled from their rims: {filled.sum()}" in invoke("surface", *words, "--overwrite").stdout
+    assert invoke("surface", *words).exit_code == 0
+    assert f"the run in {tmp_path / 'out'} was already complete" in caplog.text
+    refused(("surface", *words, "--fill-distance", 5), "holds another run")
+    row = {"name": "out", "images": [str(image) for image in sweep.images], "resolution": PIXEL, "crs": CRS}
+    (tmp_path / "rows.json").write_text(json.dumps([row | {"fill": 20, "mask": "mask.tif"}]))
+    assert invoke("batch", tmp_path / "rows.json", tmp_path / "batch").exit_code == 0
+    assert files_of(tmp_path / "batch" / "out") == files_of(tmp_path / "out")
 
 
 def test_surface_of_many__finds_the_heights_on_a_part_of_a_large_grid(sweep, tmp_path):

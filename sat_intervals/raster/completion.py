@@ -1,0 +1,180 @@
+"""Complete a surface: areas without data or of one height, and voids filled from their rims."""
+
+import os
+from collections import Counter
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from hashlib import sha256
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.kernels.conformal import outwards
+from sat_intervals.kernels.filling import filled
+from sat_intervals.machine import usable_cores
+from sat_intervals.products import as_json
+from sat_intervals.raster.files import File
+from sat_intervals.raster.georeferencing import Georeferencing
+from sat_intervals.raster.layers import read_layers, read_shape
+from sat_intervals.raster.polygons import Areas
+from sat_intervals.raster.writer import OutputWriter
+from sat_intervals.tiling import Window
+
+_FARTHEST = 256  # cells to the rim of a void: tiles are read with twice as many around them
+_TILE, _CELLS, _LOWEST = 1024, 1 << 21, 64  # columns of a tile, cells of a strip, its rows at least
+_APART = 1.0  # cells: rims closer to a plane are of smooth ground
+# Cells around an area that are its rim, and the share of them below its height.
+_RIM, _LOW = 3, 0.1
+
+
+@dataclass(frozen=True)
+class Completion:
+    """What is done to a measured surface: metres up to which voids are filled, areas of one height, and of no data.
+
+    ``key``: digest of all of it.
+    """
+
+    fill: float | None
+    flatten: Areas | None
+    mask: Areas | None
+    key: str
+
+    @classmethod
+    def of(cls, fill: float | None, flatten: Areas | None, mask: Areas | None) -> "Completion":
+        """Return it with its key."""
+        areas = [one and [one.crs, one.polygons] for one in (flatten, mask)]
+        return cls(fill, flatten, mask, sha256(as_json([fill, *areas]).encode()).hexdigest())
+
+    def check(self, cell: float) -> None:
+        """Raise for voids that are filled from too many cells away."""
+        if self.fill and not cell <= self.fill <= _FARTHEST * cell:
+            raise SatIntervalsError(
+                f"fill distance is {self.fill:g} m: give {cell:g} to {_FARTHEST * cell:g}, 1 to {_FARTHEST} cells"
+            )
+
+    def tags(self) -> dict[str, str]:
+        """Return tags of the surface."""
+        tags = {"FILLED": f"voids up to {self.fill:g} m from their rims"} if self.fill else {}
+        named = {"FLATTENED": self.flatten, "MASKED": self.mask}
+        return tags | {name: areas.path.name for name, areas in named.items() if areas}
+
+    def on(self, place: Georeferencing, shape: tuple[int, int]) -> "Completion":
+        """Return it with the areas that are on a surface; raise if a file has none."""
+        flatten, mask = (areas and areas.on(place, shape) for areas in (self.flatten, self.mask))
+        for areas in (flatten, mask):
+            if areas and not areas.polygons:
+                raise SatIntervalsError(f"{areas.path} has no area on the surface: check its CRS, or leave it out")
+        return replace(self, flatten=flatten, mask=mask)
+
+
+def complete(
+    path: Path,
+    file: File,
+    place: Georeferencing,
+    tags: dict[str, str],
+    completion: Completion,
+    progress: Callable[[str, int, int], None],
+) -> dict[str, Any]:
+    """Replace a measured surface by the complete one; return numbers of cells.
+
+    These are ``filled``, ``flattened`` and ``masked``, and ``voids``, those that stay; ``areas`` of one height, and
+    those ``without_rim``.
+    """
+    surface = _Surface(path, place, completion)
+    counts, row, file = Counter[str](), 0, replace(file, name=f"{path.name}.complete")
+    with OutputWriter(path.parent, [file], *surface.shape, place, tags) as writer:
+        for parts in surface.strips():
+            bands, counted = zip(*parts, strict=True)
+            counts = sum(counted, counts)
+            writer.write(row, np.concatenate(bands, axis=2))
+            row += bands[0].shape[1]
+            progress("fill", row, surface.shape[0])
+        os.replace(writer.build()[file.name], path)
+    without = int(np.isnan(surface.levels[0]).sum())
+    areas = {"areas": surface.levels.shape[1], "without_rim": without}
+    return {name: counts[name] for name in ("filled", "flattened", "masked", "voids")} | areas
+
+
+class _Surface:
+    """A measured surface that is completed tile by tile; ``levels``: height and bounds of areas, ``(3, n)``."""
+
+    def __init__(self, path: Path, place: Georeferencing, how: Completion) -> None:
+        self.shape = read_shape(path)[1:]
+        self._path, self._place, self._how = path, place, (how := how.on(place, self.shape))
+        self._reach = int((how.fill or 0.0) / place.pixel_size[0])
+        self.levels = self._levels(how.flatten) if how.flatten else np.empty((3, 0))
+
+    def strips(self) -> Iterator[list[tuple[np.ndarray, Counter[str]]]]:
+        """Yield the tiles of strips: bands and counts."""
+        with ThreadPoolExecutor(usable_cores()) as threads:
+            for windows in self._windows():
+                yield list(threads.map(self._tile, windows))
+
+    def _windows(self) -> Iterator[list[Window]]:
+        rows, columns = self.shape
+        height, whole = max(_LOWEST, _CELLS // columns), Window(0, 0, rows, columns)
+        for row in range(0, rows, height):
+            yield [Window(row, first, height, _TILE).clipped(whole) for first in range(0, columns, _TILE)]
+
+    def _read(self, window: Window, reach: int) -> tuple[Window, np.ndarray, np.ndarray]:
+        """Return a window grown by a reach, its bands with masked cells NaN, and which cells are masked."""
+        around = window.grown(reach, reach).clipped(Window(0, 0, *self.shape))
+        bands = read_layers(self._path, around)
+        masked = self._numbers(self._how.mask, around) > 0
+        bands[:, masked] = np.nan
+        return around, bands, masked
+
+    def _numbers(self, areas: Areas | None, window: Window) -> np.ndarray:
+        """Return the numbers of areas, from 1, of cells."""
+        shape = window.height, window.width
+        return areas.numbers(self._place.shifted(window), shape) if areas else np.zeros(shape, np.int32)
+
+    def _tile(self, window: Window) -> tuple[np.ndarray, Counter[str]]:
+        around, bands, masked = self._read(window, 2 * self._reach)
+        numbers = self._numbers(self._how.flatten, around)
+        flat = (numbers > 0) & ~masked
+        bands[:, flat] = np.nan
+        bands[:3, flat] = self.levels[:, numbers[flat] - 1]
+        is_new = flat & np.isfinite(bands[0])
+        voids = np.zeros(masked.shape, bool)
+        inner = window.relative_to(around).slices
+        voids[inner] = (np.isnan(bands[0]) & ~masked & ~flat)[inner] & bool(self._how.fill)
+        found = filled(*bands[:3].astype(np.float64), voids, float(self._reach), _APART * self._place.pixel_size[0])
+        voids &= np.isfinite(found[0])
+        bands[0][voids] = found[0][voids]
+        for band, end in ((1, -np.inf), (2, np.inf)):
+            bands[band][voids] = outwards(found[band][voids], end)
+        bands[3:5, is_new | voids] = 0
+        chosen = {"filled": voids, "flattened": is_new, "masked": masked, "voids": np.isnan(bands[0]) & ~masked}
+        counts = Counter({name: int(cells[inner].sum()) for name, cells in chosen.items()})
+        return bands[(slice(None), *inner)], counts
+
+    def _levels(self, areas: Areas) -> np.ndarray:
+        """Return height and bounds of each area: those of a low quantile of its rim, NaN without one."""
+        found = [self._rims(areas, window) for windows in self._windows() for window in windows]
+        numbers, cells = (np.concatenate(part, axis=-1) for part in zip(*found, strict=True))
+        order = np.argsort(numbers, kind="stable")
+        starts = np.searchsorted(numbers[order], np.arange(1, len(areas.polygons) + 2))
+        levels = np.full((3, len(areas.polygons)), np.nan)
+        for number, (first, last) in enumerate(pairwise(starts)):
+            if first < last:
+                height, lower, upper = cells[:, order[first:last]].astype(np.float64)
+                level = np.quantile(height, _LOW)
+                below, above = np.median(height - lower), np.median(upper - height)
+                levels[:, number] = level, level - below, level + above
+        return levels
+
+    def _rims(self, areas: Areas, window: Window) -> tuple[np.ndarray, np.ndarray]:
+        """Return numbers of the areas whose rims have the cells of a window, ``(n,)``; their heights and bounds."""
+        around, bands, _ = self._read(window, _RIM)
+        near = numbers = self._numbers(areas, around)
+        for axis in (0, 1):
+            padded = np.pad(near, [(_RIM, _RIM) if axis == one else (0, 0) for one in (0, 1)])
+            near = np.lib.stride_tricks.sliding_window_view(padded, 2 * _RIM + 1, axis).max(axis=-1)
+        inner = window.relative_to(around).slices
+        rim = ((near > 0) & (numbers == 0) & np.isfinite(bands[0]))[inner]
+        return near[inner][rim], bands[:3][(slice(None), *inner)][:, rim]
