@@ -774,6 +774,6 @@ def filled(height, lower, upper, voids, reach, apart):
         two = np.argsort(z)[:2]
         value = plane[0] if is_smooth else z[two[1]]
         above = np.mean((upper[at] - z)[two])
-        top = value + max(above, 0 if is_smooth else 0.75 * (z.max() - value))
+        top = value + max(above, 0 if is_smooth else 0.95 * (z.max() - value))
         result[:, i, j] = value, value - np.mean((z - lower[at])[two]), top
     return result

@@ -14,7 +14,7 @@ _STEPS = np.array([(c * y - s * x, s * y + c * x) for c, s in ((1, 0), (0, 1), (
 # Directions with a rim that a void inside a surface has: a straight border has 7 to 9 of 16.
 _LEAST = 10
 # Share of the way to the highest of the rim that the upper bound is above a cell between roof and ground.
-_SHARE = 0.75
+_SHARE = 0.95
 
 
 @part

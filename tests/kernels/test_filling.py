@@ -43,7 +43,7 @@ def test_filled__takes_the_ground_beside_a_roof_and_the_slope_of_a_hill():
     height, lower, upper = filled(*street, np.isnan(street[0]), 12.0, 1.0)[:, 3:-3, 9:12]
     assert (height == 5).all()
     assert (lower == 4.5).all()
-    assert_allclose(upper, 5 + 0.75 * 15)
+    assert_allclose(upper, 5 + 0.95 * 15)
     hill = ground(1, 3, 0)
     hole = np.isnan(hill[0])
     found = filled(*hill, hole, 9.0, 1.0)[0, 6:-6, 6:-6]

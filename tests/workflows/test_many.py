@@ -74,7 +74,7 @@ def test_surface_of_many__has_the_same_bytes_for_any_tiles_and_says_that_it_was_
         surface(sweep.images, out, settings, **OPTIONS)
 
 
-def test_surface_of_many__is_completed_the_same_in_a_batch_and_knows_with_what(sweep, tmp_path, caplog):
+def test_surface_of_many__is_completed_the_same_in_a_batch_and_knows_with_what(sweep, tmp_path):
     cells = sweep.report["sweep"]["cells"]
     mask = np.zeros((cells["rows"], cells["columns"]), np.uint8)
     mask[60:70, 60:70] = 1
@@ -91,8 +91,7 @@ def test_surface_of_many__is_completed_the_same_in_a_batch_and_knows_with_what(s
     kept = np.isfinite(measured[0]) & (mask == 0)
     assert_array_equal(bands[:, kept], measured[:, kept])
     assert f"cells filled from their rims: {filled.sum()}" in invoke("surface", *words, "--overwrite").stdout
-    assert invoke("surface", *words).exit_code == 0
-    assert f"the run in {tmp_path / 'out'} was already complete" in caplog.text
+    assert "was already complete" in invoke("surface", *words).stderr
     refused(("surface", *words, "--fill-distance", 5), "holds another run")
     row = {"name": "out", "images": [str(image) for image in sweep.images], "resolution": PIXEL, "crs": CRS}
     (tmp_path / "rows.json").write_text(json.dumps([row | {"fill": 20, "mask": "mask.tif"}]))
