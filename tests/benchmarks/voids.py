@@ -1,10 +1,10 @@
 """The tables of docs/heights.md on voids (`make voids-bench`): coverage and errors of filled cells, fifteen minutes.
 
 Surfaces of ten images and of five pairs of jax_068, in SAT_INTERVALS_SHARED, against LiDAR, and of pairs and of six
-views of three towns with exact truth. None of these towns was looked at when the rule was chosen. *Own*: the voids of
-the surface. *Moved*: the same voids, moved to where the surface has heights. *Ground*: own voids where the truth is
-ground, within 10 m of what is 3 m higher. Truth is moved by whole cells and a constant onto a surface, but not that of
-pairs of towns. The last line is the mean absolute error over all cells of ten images, with the winners in voids, and filled.
+views of three towns with exact truth. The rule was chosen on these images and on other towns. *Own*: the voids of the
+surface. *Moved*: the same voids, moved to where the surface has heights. *Ground*: own voids where the truth is ground,
+within 10 m of what is 3 m higher. Truth is moved by whole cells and a constant onto a surface, but not that of pairs of
+towns. The last line is the mean absolute error over all cells of ten images, with the winners in voids, and filled.
 Surfaces are kept in `build/voids`.
 """
 
