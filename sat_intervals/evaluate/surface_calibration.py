@@ -125,7 +125,8 @@ def calibrate_surface(
 
 def _checked_coverage(surface: Path, tags: Mapping[str, str], coverage: float | None) -> float:
     """Return the coverage to reach; raise if it or the surface cannot be used."""
-    for tag, option in (("CALIBRATION", "--calibration"), ("MAX_WIDTH", "--max-width")):
+    options = {"CALIBRATION": "--calibration", "MAX_WIDTH": "--max-width", "FILLED": "--fill", "FLATTENED": "--flatten"}
+    for tag, option in options.items():
         if tag in tags:
             raise SatIntervalsError(f"{surface} was made with {option}: make it without, then calibrate it")
     if coverage is None and "COVERAGE" not in tags:

@@ -184,6 +184,7 @@ def test_calibrate_command__a_surface_that_it_cannot_use_is_one_line(tmp_path):
 
     calibrated = surface("calibrated.tif", TAGS | {"CALIBRATION": "x"})
     cut = surface("cut.tif", TAGS | {"MAX_WIDTH": "5 m"})
+    complete = surface("complete.tif", TAGS | {"FILLED": "voids up to 20 m from their rims"})
     alpha = surface("alpha.tif", {"ALPHA": "0.9"})
     no_bounds = surface("heights.tif", TAGS, np.nan)
     away = write_raster(tmp_path / "away.tif", [height], Affine(1, 0, 5, 0, -1, 5))
@@ -202,6 +203,7 @@ def test_calibrate_command__a_surface_that_it_cannot_use_is_one_line(tmp_path):
         ([*given, "--output", tmp_path / "no" / "x.yaml"], "give --output a file in an existing folder"),
         (["--dsm", calibrated, "--reference", flat], "was made with --calibration: make it without"),
         (["--dsm", cut, "--reference", flat], "was made with --max-width: make it without"),
+        (["--dsm", complete, "--reference", flat], "was made with --fill: make it without"),
         (["--dsm", alpha, "--reference", flat], "its runs were matched without one: give --coverage"),
         (["--dsm", no_bounds, "--reference", flat], "0 cells of"),
         (["--dsm", model, "--reference", away], "give a reference of the same place"),
