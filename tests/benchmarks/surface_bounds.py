@@ -95,14 +95,14 @@ def truth_of(place, shape, kind):
 def surface_of(outs, path, cell, bounds, kind, pixel, like=None):
     """Cells of a surface with interval and truth, and which of them are near walls.
 
-    With ``like``, another surface, on its grid: cells with an interval there.
+    With ``like``, another surface, on its grid: cells with an interval there, too.
     """
     choices = SurfaceChoices(bounds, keeps_open=bounds == "envelope")
     make_surface(outs, path, resolution=like or cell * PIXEL, crs=None if like else CRS, choices=choices)
     with rasterio.open(path) as dataset, rasterio.open(like or path) as first:
         height, lower, upper = dataset.read((1, 2, 3)).astype(np.float64)
         truth, range_ = truth_of(dataset.transform, dataset.shape, kind)
-        known = np.isfinite(truth) & np.isfinite(first.read(2))
+        known = np.isfinite(truth) & np.isfinite(first.read(2)) & np.isfinite(lower)
     row, column = (4 * np.arange(size) // size for size in known.shape)
     block = 4 * row[:, np.newaxis] + column
     walls = range_[known] > max(2.2 * pixel, cell * PIXEL)
