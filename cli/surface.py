@@ -51,7 +51,7 @@ def surface(
     from sat_intervals.errors import check_absent
     from sat_intervals.workflows.surface import FILES, surface
 
-    if len(sensor_files) > 1:
+    if sensor_files[1:]:
         raise click.UsageError("give --left-model, --right-model, --left-grid and --right-grid once.")
     if pair.more:
         check_absent({"--left-model": sensor_files or None}, "two images")
@@ -65,9 +65,7 @@ def surface(
             images,
             out,
             config,
-            **cells,
-            **raw,
-            **ground,
+            **(cells | raw | ground),
             ortho=ortho,
             sensors=sensor_files[0] if sensor_files else (),
             window=pair.window,
