@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 _DISAGREEING = 0.1
 # Metres of height that two datums may differ by.
 _OTHER_DATUM = 10.0
+_FILL_DISTANCE = 20.0  # metres
 _GRID_OPTIONS = (
     click.option("--resolution", type=float, metavar="METRES", help="Side of a cell; or give --grid-like."),
     click.option("--grid-like", type=options.FILE, help="North-up raster whose grid and CRS the surface takes."),
@@ -65,9 +66,7 @@ _CELL_OPTIONS = (
         "--fill-distance",
         type=float,
         metavar="METRES",
-        default=20.0,
-        show_default=True,
-        help="With --fill: reach from a void to its rim.",
+        help=f"Reach from a void to its rim, {_FILL_DISTANCE:g} by default; fills, too.",
     ),
     click.option("--flatten", type=options.FILE, help="Polygons or a raster, not 0 inside: areas of one height."),
     click.option("--mask", type=options.FILE, help="Polygons or a raster, not 0 inside: areas of no data."),
@@ -95,7 +94,8 @@ def cell_options(command: options.Command) -> options.Command:
         names = ("bounds", "keeps_open", "keeps_border", "outliers", "max_width", "min_confidence", "flatten", "mask")
         choices = {name: given.pop(name) for name in names}
         distance = given.pop("fill_distance")
-        choices["fill"] = distance if given.pop("fills") else None
+        fills = given.pop("fills")
+        choices["fill"] = _FILL_DISTANCE if fills and distance is None else distance
         calibration = given.pop("height_calibration")
         cells = {name: given.pop(name) for name in ("resolution", "crs", "radius", "geoid")}
         cells["resolution"] = side_of(cells["resolution"], given.pop("grid_like"))
@@ -216,9 +216,9 @@ def dsm(
     from sat_intervals.raster.publishing import check_free
     from sat_intervals.run.status import runs_of
 
-    output = options.output_file(output, outs[0] / "dsm.tif", overwrite=overwrite)
-    if ortho and output.parent != outs[0]:
+    if ortho and output:
         check_free(output.with_name("ortho.tif"), overwrite=overwrite)
+    output = options.output_file(output, outs[0] / "dsm.tif", overwrite=overwrite)
     outs = tuple(run for out in outs for run in runs_of(out))
     cells["choices"] = replace(cells["choices"], aligns=aligns, reference=reference, ortho=ortho)
     with printing.console() as console:

@@ -771,9 +771,8 @@ def filled(height, lower, upper, voids, reach, apart):
         is_smooth = np.abs(height[both] - terms @ plane).max() <= apart
         at = tuple(np.transpose(rim))
         z = height[at]
-        two = np.argsort(z)[:2]
-        value = plane[0] if is_smooth else z[two[1]]
-        above = np.mean((upper[at] - z)[two])
+        value = plane[0] if is_smooth else np.sort(z)[1]
+        above = np.mean(upper[at] - z)
         top = value + max(above, 0 if is_smooth else 0.95 * (z.max() - value))
-        result[:, i, j] = value, value - np.mean((z - lower[at])[two]), top
+        result[:, i, j] = value, value - np.mean(z - lower[at]), top
     return result

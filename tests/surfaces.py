@@ -23,7 +23,7 @@ def write_raster(path, bands, place=PLACE, crs="EPSG:32631", tags=None):
 
 def write_surface(path, height, lower, upper, tags=None):
     """Write a surface model of cells of 1 m."""
-    more = np.zeros((len(SURFACE) - 3, *np.shape(height)))
+    more = np.ones((len(SURFACE) - 3, *np.shape(height)))
     return write_raster(path, np.concatenate([[height, lower, upper], more]), tags=tags)
 
 

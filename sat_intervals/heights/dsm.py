@@ -146,6 +146,7 @@ def _write(
     """Write the strips of a surface and complete it; return what cells have, and the numbers of `complete`."""
     tally, place = CellCounts(), north_up(crs, cells.left, cells.top, cells.resolution)
     file, completed = surface_file(path.name), None
+    completion = completion and completion.on(place, (cells.rows, cells.columns))
     tags |= completion.tags() if completion else {}
     with OutputWriter(path.parent, [file], cells.rows, cells.columns, place, tags) as writer:
         for row, bands, counts in parts:

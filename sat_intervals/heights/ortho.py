@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.point_cloud import Cells
 from sat_intervals.heights.rectify import raw_inputs
 from sat_intervals.kernels.resampling import resample
@@ -52,8 +53,7 @@ class Drape:
         from sat_intervals.heights.views import towards  # needs the extra `dsm`
 
         (rows, columns), place = read_place(surface)
-        known = read_small_layers(surface, (min(rows, _FEW), min(columns, _FEW)))[0]
-        ends = float(np.nanmin(known)), float(np.nanmax(known))
+        ends = _ends(surface, (rows, columns))
         cell = place.pixel_size[0]
         return cls(surface, images, ground, -towards(ground, cell) / cell, ends)
 
@@ -90,6 +90,14 @@ class Drape:
         found = np.stack([ortho(view, ground.positions(n, window, disparity)) for n, view in enumerate(views)])
         found[np.stack([hidden(all_heights, heights.shape, sight) for sight in self.sights])] = np.nan
         return np.where(known, median_of(found), np.float32(np.nan)).astype(np.float32)
+
+
+def _ends(surface: Path, shape: tuple[int, int]) -> tuple[float, float]:
+    """Return the lowest and the highest of some heights of a surface; raise if it has none."""
+    known = read_small_layers(surface, (min(shape[0], _FEW), min(shape[1], _FEW)))[0]
+    if not np.isfinite(known).any():
+        raise SatIntervalsError(f"{surface} has no heights: leave out ortho")
+    return float(np.nanmin(known)), float(np.nanmax(known))
 
 
 def ortho(view: View, places: np.ndarray) -> np.ndarray:
@@ -136,8 +144,8 @@ def write_ortho_of(
     (rows, columns), place = read_place(surface)
     east, north, up = shift
     cells = Cells(place.affine.c - east, place.affine.f - north, place.pixel_size[0], rows, columns)
-    known = read_small_layers(surface, (min(rows, _FEW), min(columns, _FEW)))[0]
-    ends = float(np.nanmin(known)) - up, float(np.nanmax(known)) - up + 1
+    lowest, highest = _ends(surface, (rows, columns))
+    ends = lowest - up, highest - up + 1
     ground = views_of(left, projection, cells, ends, np.zeros((1, 2)))
     ground = replace(ground, lowest=ground.lowest + up)
     Drape.of(surface, images[:1], ground).write(

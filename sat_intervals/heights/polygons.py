@@ -12,7 +12,7 @@ from sat_intervals.raster import Georeferencing
 from sat_intervals.raster.polygons import Areas, Polygon
 from sat_intervals.raster.publishing import write_file
 
-_POLYGONS = 3, 6  # types of shapely
+_POLYGON = 3  # type of shapely
 _VECTORS = ".gpkg", ".geojson", ".json", ".shp", ".fgb", ".parquet"
 
 
@@ -41,8 +41,9 @@ def read_areas(path: Path) -> Areas:
         from pyogrio.raw import read
 
         known, _, geometry, _ = read(path, columns=[])
-        found = shapely.force_2d(shapely.from_wkb(geometry))
-        polygons = [shapely.geometry.mapping(one) for one in found[np.isin(shapely.get_type_id(found), _POLYGONS)]]
+        found = shapely.get_parts(shapely.force_2d(shapely.from_wkb(geometry)))  # each lake has its own height
+        found = found[(shapely.get_type_id(found) == _POLYGON) & ~shapely.is_empty(found)]
+        polygons = [shapely.geometry.mapping(one) for one in found]
     if not known["crs"]:
         raise SatIntervalsError(f"{path} has no CRS: declare it, such as with ogr2ogr -a_srs EPSG:32637")
     return Areas.of(path, known["crs"], polygons)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sat_intervals.errors import ChangedInputError, SatIntervalsError
+from sat_intervals.errors import ChangedInputError, SatIntervalsError, check_file
 from sat_intervals.products import Band, plain
 from sat_intervals.progress import Progress
 from sat_intervals.raster import File, Georeferencing, Image, OutputWriter, check_not_replaced, describe
@@ -198,5 +198,7 @@ def raw_inputs(left: str | Path, right: str | Path) -> dict[str, Any]:
             f"{left} was not rectified by sat-intervals, so its raw image is unknown: leave out ortho"
         )
     inputs = dict((read_record(Path(left).parent) or {})["inputs"])
-    open_input(inputs["left"])  # raises if it is missing
+    for side in ("left", "right"):
+        open_input(inputs[side])  # raises if it is missing
+        check_file(Path(inputs[f"{side}_model"]["path"]), "its model is needed for an ortho-image")
     return inputs

@@ -106,10 +106,10 @@ def filled(height, lower, upper, voids, reach, apart):
             is_smooth = away <= apart
             value = middle if is_smooth else z[next_low]
             below = above = 0.0
-            for k in (low, next_low):
+            for k in range(count):
                 row, column = found[k]
-                below += (z[k] - lower[row, column]) / 2
-                above += (upper[row, column] - z[k]) / 2
+                below += (z[k] - lower[row, column]) / count
+                above += (upper[row, column] - z[k]) / count
             top = 0.0 if is_smooth else _SHARE * (z[:count].max() - value)
             result[0, i, j], result[1, i, j] = value, value - below
             result[2, i, j] = value + (top if top > above else above)

@@ -68,7 +68,7 @@ def template(file: File, place: Georeferencing, tags: Mapping[str, str]) -> Temp
         ghost, directories = _parsed(bytes(made.getbuffer()))
     whole = directories[0]
     level = tags.get("HEIGHTS", "")
-    if file.is_of_heights and level.startswith("above") and place.crs:
+    if file.is_of_heights and level.startswith("above") and place.crs and _KEYS in whole:
         keys, texts = with_vertical(place.crs, level, whole[_KEYS][2], whole[_TEXTS][2])
         whole |= {_KEYS: (_SHORT, len(keys) // 2, keys), _TEXTS: (_ASCII, len(texts), texts)}
     return ghost, directories

@@ -1,5 +1,6 @@
 """Complete a surface: areas without data or of one height, and voids filled from their rims."""
 
+import logging
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -24,11 +25,15 @@ from sat_intervals.raster.polygons import Areas
 from sat_intervals.raster.writer import OutputWriter
 from sat_intervals.tiling import Window
 
-_FARTHEST = 256  # cells to the rim of a void: tiles are read with twice as many around them
+# Cells to the rim of a void: nearer ones have fewer directions; tiles are read with twice as many around them.
+_NEAREST, _FARTHEST = 2, 256
 _TILE, _CELLS, _LOWEST = 1024, 1 << 21, 64  # columns of a tile, cells of a strip, its rows at least
 _APART = 1.0  # cells: rims closer to a plane are of smooth ground
 # Cells around an area that are its rim, and the share of them below its height.
 _RIM, _LOW = 3, 0.1
+
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -51,10 +56,9 @@ class Completion:
 
     def check(self, cell: float) -> None:
         """Raise for voids that are filled from too many cells away."""
-        if self.fill and not cell <= self.fill <= _FARTHEST * cell:
-            raise SatIntervalsError(
-                f"fill distance is {self.fill:g} m: give {cell:g} to {_FARTHEST * cell:g}, 1 to {_FARTHEST} cells"
-            )
+        if self.fill and not _NEAREST * cell <= self.fill <= _FARTHEST * cell:
+            ends = f"{_NEAREST * cell:g} to {_FARTHEST * cell:g} m, {_NEAREST} to {_FARTHEST} cells"
+            raise SatIntervalsError(f"fill distance is {self.fill:g} m: give {ends}")
 
     def tags(self) -> dict[str, str]:
         """Return tags of the surface."""
@@ -63,11 +67,11 @@ class Completion:
         return tags | {name: areas.path.name for name, areas in named.items() if areas}
 
     def on(self, place: Georeferencing, shape: tuple[int, int]) -> "Completion":
-        """Return it with the areas that are on a surface; raise if a file has none."""
+        """Return it with the areas that are on a surface; warn if a file has none."""
         flatten, mask = (areas and areas.on(place, shape) for areas in (self.flatten, self.mask))
         for areas in (flatten, mask):
             if areas and not areas.polygons:
-                raise SatIntervalsError(f"{areas.path} has no area on the surface: check its CRS, or leave it out")
+                _LOG.warning("%s has no area on the surface: check its CRS, or leave it out", areas.path)
         return replace(self, flatten=flatten, mask=mask)
 
 
@@ -104,8 +108,8 @@ class _Surface:
 
     def __init__(self, path: Path, place: Georeferencing, how: Completion) -> None:
         self.shape = read_shape(path)[1:]
-        self._path, self._place, self._how = path, place, (how := how.on(place, self.shape))
-        self._reach = int((how.fill or 0.0) / place.pixel_size[0])
+        self._path, self._place, self._how = path, place, how
+        self._reach = int((how.fill or 0.0) / place.pixel_size[0] + 1e-6)
         self.levels = self._levels(how.flatten) if how.flatten else np.empty((3, 0))
 
     def strips(self) -> Iterator[list[tuple[np.ndarray, Counter[str]]]]:
@@ -164,14 +168,16 @@ class _Surface:
             if first < last:
                 height, lower, upper = cells[:, order[first:last]].astype(np.float64)
                 level = np.quantile(height, _LOW)
-                below, above = np.median(height - lower), np.median(upper - height)
+                below, above = np.nanmedian(height - lower), np.nanmedian(upper - height)
                 levels[:, number] = level, level - below, level + above
         return levels
 
     def _rims(self, areas: Areas, window: Window) -> tuple[np.ndarray, np.ndarray]:
         """Return numbers of the areas whose rims have the cells of a window, ``(n,)``; their heights and bounds."""
+        near = numbers = self._numbers(areas, window.grown(_RIM, _RIM).clipped(Window(0, 0, *self.shape)))
+        if not numbers.any():
+            return np.empty(0, np.int32), np.empty((3, 0), np.float32)
         around, bands, _ = self._read(window, _RIM)
-        near = numbers = self._numbers(areas, around)
         for axis in (0, 1):
             padded = np.pad(near, [(_RIM, _RIM) if axis == one else (0, 0) for one in (0, 1)])
             near = np.lib.stride_tricks.sliding_window_view(padded, 2 * _RIM + 1, axis).max(axis=-1)

@@ -44,7 +44,8 @@ class Epoch:
     def read(self, window: Window) -> np.ndarray:
         """Read height and both bounds of a window inside: ``(3, rows, columns)`` float64, NaN where unknown."""
         if self.sigma is None and self.band is None:
-            return read_layers(self.path, window)[:3].astype(np.float64)
+            bands = read_layers(self.path, window).astype(np.float64)
+            return np.where(bands[3] == 0, np.nan, bands[:3])  # filled and flattened cells were not measured
         height = read_heights(self.path, self.place, self.shape, window)
         height[~is_ground(height)] = np.nan  # undeclared no data
         half = self.deviations * (_sigma_of(self.path, window, self.band) if self.band else self.sigma or 0.0)

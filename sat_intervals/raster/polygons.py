@@ -1,20 +1,23 @@
 """Turn cells into polygons and polygons into cells."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
 from rasterio.features import bounds, rasterize, shapes
 from rasterio.transform import array_bounds
-from rasterio.warp import transform_geom
+from rasterio.warp import transform_bounds, transform_geom
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.images import opened
 from sat_intervals.raster.surfaces import read_place
+
+_ONE = Lock()  # rasterio changes the filters of warnings, which all threads share
 
 Polygon = Mapping[str, Any]
 """A polygon as GeoJSON has it."""
@@ -55,23 +58,23 @@ class Areas:
     def on(self, place: Georeferencing, shape: tuple[int, int]) -> "Areas":
         """Return the areas that are on a surface, on its map."""
         assert place.crs is not None
-        crs = place.crs.to_wkt()
-        try:
-            moved = Areas.of(self.path, crs, transform_geom(self.crs, crs, self.polygons) if self.polygons else [])
+        crs, extent = place.crs.to_wkt(), array_bounds(*shape, place.affine)
+        try:  # those of other places may be on no map of this one
+            near = [self.polygons[one] for one in self._near(transform_bounds(crs, self.crs, *extent))]
+            return Areas.of(self.path, crs, transform_geom(self.crs, crs, near) if near else [])
         except gdal.GDAL_ERRORS as error:
             raise SatIntervalsError(f"{self.path} is not on the map of the surface: {gdal.reason(error)}") from error
-        near = moved._near(place, shape)
-        return replace(moved, polygons=[moved.polygons[one] for one in near], extents=moved.extents[near])
 
-    def _near(self, place: Georeferencing, shape: tuple[int, int]) -> list[int]:
-        """Return the indices of the areas whose extents meet that of some cells."""
-        left, bottom, right, top = array_bounds(*shape, place.affine)
+    def _near(self, extent: tuple[float, float, float, float]) -> list[int]:
+        """Return the indices of the areas whose extents meet one: left, bottom, right, top."""
+        left, bottom, right, top = extent
         wests, souths, easts, norths = self.extents.T
         return np.flatnonzero((wests < right) & (left < easts) & (souths < top) & (bottom < norths)).tolist()
 
     def numbers(self, place: Georeferencing, shape: tuple[int, int]) -> np.ndarray:
         """Return the number of the area, from 1, that has the centre of each cell, 0 of none; the last one counts."""
-        numbered = [(self.polygons[one], one + 1) for one in self._near(place, shape)]
+        numbered = [(self.polygons[one], one + 1) for one in self._near(array_bounds(*shape, place.affine))]
         if not numbered:
             return np.zeros(shape, np.int32)
-        return np.asarray(rasterize(numbered, shape, transform=place.affine, dtype=np.int32))
+        with _ONE:
+            return np.asarray(rasterize(numbered, shape, transform=place.affine, dtype=np.int32))

@@ -27,7 +27,7 @@ from sat_intervals.match.postprocess import (
 from sat_intervals.match.refinement import pixel_windows, pixels_of
 from sat_intervals.match.statistics import Tally
 from sat_intervals.prepare.local import given_disparities
-from sat_intervals.products import Bands
+from sat_intervals.products import SURFACE, Bands
 from sat_intervals.progress import Progress
 from sat_intervals.raster import BLOCK, codec_versions, compressed, factors, halved, read_views
 from sat_intervals.run.job import Job
@@ -141,8 +141,9 @@ def finish_strip(job: Job, of: str, key: PartKey, scale: ConfidenceScale) -> str
         margin = halo(job.config) + (AROUND if job.swept and job.swept.calibration else 0)
         first, last = key[1] * BLOCK, min(region.height, (key[1] + 1) * BLOCK)
         top, bottom = max(0, first - margin), min(region.height, last + margin)
-        shape, extra = (last - first, region.width), job.config.extra_bands
-        intervals, validity = np.empty((4 + len(extra), *shape), np.float32), np.empty((1, *shape), np.uint16)
+        shape, extra = (last - first, region.width), () if job.swept else job.config.extra_bands
+        bands = len(SURFACE) if job.swept else 4 + len(extra)
+        intervals, validity = np.empty((bands, *shape), np.float32), np.empty((1, *shape), np.uint16)
         given = given_disparities(job.config, Window(region.row + first, region.column, *shape))
         tally, row = Tally(search.count, search.minimum), 0
         counts = list[np.ndarray]()
@@ -154,14 +155,13 @@ def finish_strip(job: Job, of: str, key: PartKey, scale: ConfidenceScale) -> str
                 rows = slice(row, row := row + len(final.validity))
                 if given is not None:
                     final = with_agreement(final, given[rows])
-                bands = [*final[:4], *(getattr(final, name) for name in extra)]
-                intervals[:, rows], validity[:, rows] = bands, final.validity
+                intervals[: 4 + len(extra), rows] = [*final[:4], *(getattr(final, name) for name in extra)]
+                validity[:, rows] = final.validity
                 tally.add(final)
         except DamagedTilesError as error:
             return str(error)
         if job.swept:
-            count = np.concatenate(counts)[first - top :][: shape[0]]
-            intervals = _heights(intervals, count, job.ground())
+            _to_heights(intervals, np.concatenate(counts)[first - top :][: shape[0]], job.ground())
         _write(job, of, key, [intervals, validity], counts=tally.counts())
     return None
 
@@ -177,13 +177,15 @@ def _widened(finals: Iterable[Bands], calibration: HeightCalibration, ground: Gr
         yield final._replace(lower=lower.astype(np.float32), upper=upper.astype(np.float32))
 
 
-def _heights(bands: np.ndarray, count: np.ndarray, ground: GroundViews | None) -> np.ndarray:
-    """Return the bands of SURFACE of disparities, which are steps of height, their bounds and confidence."""
+def _to_heights(bands: np.ndarray, count: np.ndarray, ground: GroundViews | None) -> None:
+    """Turn disparities, which are steps of height, their bounds and confidence into the bands of SURFACE, in place."""
     assert ground is not None
-    heights = ground.base + ground.step * bands[:3].astype(np.float64)
-    known = np.isfinite(bands[0])
-    seen, nothing = np.where(known, count, np.nan), np.full(known.shape, np.nan)
-    return np.stack([*heights, seen, np.where(known, bands[3], np.nan), nothing]).astype(np.float32)
+    unknown = ~np.isfinite(bands[0])
+    bands[4], bands[3] = bands[3], count
+    bands[3:5, unknown] = np.nan
+    bands[5] = np.nan
+    for band in bands[:3]:
+        band[:] = ground.base + ground.step * band.astype(np.float64)
 
 
 def raw_rows(

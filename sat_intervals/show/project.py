@@ -133,10 +133,12 @@ def _surface(run: Run) -> Iterator[ProjectLayer]:
 
 
 def _ortho(run: Run) -> Iterator[ProjectLayer]:
-    """Yield the ortho-image beside the surface, if it is one of the same run."""
-    file = run.out / ORTHO
-    if file.exists() and read_tags(file).get("RUNS") == read_tags(run.out / "dsm.tif").get("RUNS"):
+    """Yield the ortho-image beside the surface, if it is one of the same run, on its grid."""
+    file, surface = run.out / ORTHO, run.out / "dsm.tif"
+    if file.exists() and read_tags(file).get("RUNS") == read_tags(surface).get("RUNS"):
         shape, place = read_place(file)
+        if (shape, place) != read_place(surface):
+            return
         grey = styles.grey(1, read_small_layers(file, _fitting(shape))[0])
         yield ProjectLayer(
             "Heights", "ortho-image", "image on the surface", Raster(file, place, shape), grey, True, True

@@ -263,18 +263,18 @@ def with_range(config: Config, figures: Mapping[str, Any]) -> Config:
 
 def geometry_job(asked: Asked, out: Path, geometry: Geometry, region: Window | None = None, pair: str = "") -> Job:
     """Make the job of a sweep whose geometry is known: its left image is the grid of cells."""
-    ground, figures = geometry
-    _check_margins(asked.wanted.calibration, asked.config, len(figures["used"]), figures["cells"]["resolution"])
+    (ground, figures), cells = geometry, geometry[1]["cells"]
+    place = north_up(figures["crs"], cells["left"], cells["top"], cells["resolution"])
+    _check_margins(asked.wanted.calibration, asked.config, len(figures["used"]), cells["resolution"])
     swept = Swept(
         {name: asked.images[name] for name in figures["used"]},
         asked.digest,
         str(asked.wanted.geoid or "the WGS 84 ellipsoid"),
         figures | {"request": asked.request},
         asked.wanted.calibration,
-        asked.completion,
+        asked.completion and asked.completion.on(place, (cells["rows"], cells["columns"])),
     )
-    config, cells = with_range(asked.config, figures), figures["cells"]
-    place = north_up(figures["crs"], cells["left"], cells["top"], cells["resolution"])
+    config = with_range(asked.config, figures)
     name = str((out / outputs_of(config)[0]).absolute())
     frame = Image(name, 1, cells["rows"], cells["columns"], "float32", None, False, None, None, place)
     ranges = figures["ranges"] and LocalRanges.of_report(figures["ranges"])

@@ -132,7 +132,8 @@ def surface(
     cells = {"resolution": resolution, "crs": crs, "radius": radius, "geoid": geoid}
     check_cells(cells, choices, resolved(config).interval)
     pair = epipolar_pair(opened, out, sensors, window, on_rectified, geoid=geoid if dem else None, **raw, **how)
-    if ortho:
+    choices = replace(choices, ortho=ortho or choices.ortho)
+    if choices.ortho:
         raw_inputs(pair.left.path, pair.right.path)
     grid = files_of(str(resolution)) if isinstance(resolution, Path) else ()
     read = [file for one in opened for file in (one.path, one.mask)]
@@ -141,7 +142,7 @@ def surface(
     check_not_replaced(read, results, [out / "tiles"])
     check_sensors(pair.sensors, resolution, crs)
     run = match_pair(pair.left, pair.right, out, config, window=window, keep_tiles=keep_tiles, **how)
-    made = surface_of(out, pair.sensors, progress, **cells, choices=replace(choices, ortho=ortho or choices.ortho))
+    made = surface_of(out, pair.sensors, progress, **cells, choices=choices)
     doubts = pair.record["warnings"] if pair.record else []
     warnings = [*doubts, *run["warnings"], *geometry_warnings(made["geometry"])]
     return {"rectify": pair.record, "run": run, "surface": made, "warnings": warnings}

@@ -44,8 +44,8 @@ def completed(scene, **options):
     """Bands of the completed surface, and the report."""
     path, _ = scene
     there = shutil.copy(path, path.with_name("dsm.tif"))
-    how = completion_of(1.0, options.get("fill"), options.get("flatten"), options.get("mask"))
-    _, place = read_place(there)
+    shape, place = read_place(there)
+    how = completion_of(1.0, options.get("fill"), options.get("flatten"), options.get("mask")).on(place, shape)
     report = completion.complete(there, surface_file("dsm.tif"), place, how.tags(), how, lambda *_: None)
     return read_layers(there), report
 
@@ -122,14 +122,32 @@ def test_read_areas__polygons_in_degrees_are_those_of_a_raster(scene, tmp_path):
     assert np.isclose(of_polygons[0], of_raster[0], rtol=0, atol=0.3, equal_nan=True).mean() > 0.99
 
 
-def test_completion__refuses_what_it_cannot_use(scene, tmp_path):
-    with pytest.raises(SatIntervalsError, match=r"fill distance is 500 m: give 1 to 256, 1 to 256 cells"):
+@pytest.mark.peer("pyogrio", "shapely")
+def test_read_areas__each_part_is_an_area_and_those_of_other_places_do_not_matter(scene, tmp_path):
+    from pyogrio.raw import write
+    from shapely import box, multipolygons, to_wkb
+    from shapely.geometry import Polygon
+
+    west, east = (box(left, top - 9, left + 9, top) for left, top in (PLACE @ (15, 60), PLACE @ (65, 60)))
+    far = box(500_000, 0, 500_009, 9_000_000)
+    shapes = np.array([to_wkb(one) for one in (multipolygons([west, east]), far, Polygon())], object)
+    file = tmp_path / "lakes.gpkg"
+    write(file, shapes, [], [], driver="GPKG", geometry_type="Unknown", crs="EPSG:32631")
+    bands, report = completed(scene, flatten=file)
+    assert {"areas": 2, "without_rim": 0}.items() <= report.items()
+    assert bands[0, 65, 70] - bands[0, 65, 20] > 3  # the slope is .1
+
+
+def test_completion__refuses_what_it_cannot_use(scene, tmp_path, caplog):
+    with pytest.raises(SatIntervalsError, match=r"fill distance is 500 m: give 2 to 256 m, 2 to 256 cells"):
         completed(scene, fill=500.0)
     with pytest.raises(SatIntervalsError, match=r"none.tif: no such file"):
         completed(scene, mask=tmp_path / "none.tif")
     far = write_raster(tmp_path / "far.tif", np.ones((1, 9, 9)), PLACE @ PLACE.translation(9000, 0))
-    with pytest.raises(SatIntervalsError, match=r"far.tif has no area on the surface: check its CRS"):
-        completed(scene, mask=far)
+    bands, report = completed(scene, mask=far)  # one file for many places
+    assert report["masked"] == 0
+    assert "far.tif has no area on the surface: check its CRS" in caplog.text
+    assert_array_equal(bands, read_layers(scene[0]))
     (tmp_path / "broken.geojson").write_text(json.dumps({"type": "Nothing"}))
     with pytest.raises(SatIntervalsError, match=r"broken.geojson (cannot be read as polygons|needs)"):
         completed(scene, flatten=tmp_path / "broken.geojson")

@@ -85,7 +85,7 @@ def test_surface__is_compared_with_one_of_an_earlier_version(tmp_path):
     tags = {"COVERAGE": "0.9", "HEIGHTS": ELLIPSOID, "RUNS": "one"}
     old = write_surface(tmp_path / "old.tif", rows, rows - 1, rows + 1, tags)
     with OutputWriter(tmp_path, [surface_file("new.tif")], 60, 60, read_place(old)[1], tags) as writer:
-        writer.write(0, np.stack([rows, rows - 1, rows + 1, rows, rows, rows]))
+        writer.write(0, np.stack([rows, rows - 1, rows + 1, *np.ones((3, 60, 60))]))
         writer.publish()
     report = sat_intervals.change(old, tmp_path / "new.tif", tmp_path / "out", registers=False)
     assert (report["cells"]["compared"], report["areas"]) == (3600, 0)

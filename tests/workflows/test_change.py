@@ -1,6 +1,7 @@
 """Change between two dates: surfaces with known changes, errors within their intervals, and a shift."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from sat_intervals.evaluate.change import open_pair
 from sat_intervals.evaluate.change_areas import Areas, signs_of, stable_ground
 from sat_intervals.kernels import registration
 from sat_intervals.products import SURFACE
+from sat_intervals.raster import read_layers
 from sat_intervals.raster.vertical import horizontal
 
 SIDE, HALF = 180, 1.0  # cells of 1 m, half width of intervals at coverage .9
@@ -40,7 +42,7 @@ def write_date(path, seed, *, shift=(0, 0, 0), changes=(), tags=TAGS, first=(0, 
     height[150:154, 20:30] = np.nan
     if tags is None:
         return write_raster(path, [height], place, crs)
-    bands = [height, height - HALF, height + HALF, *np.zeros((len(SURFACE) - 3, SIDE, SIDE))]
+    bands = [height, height - HALF, height + HALF, *np.ones((len(SURFACE) - 3, SIDE, SIDE))]
     return write_raster(path, bands, place, crs, tags)
 
 
@@ -152,6 +154,16 @@ def test_change__of_no_smallest_area_keeps_the_rate(tmp_path):
         tmp_path / "1.tif", tmp_path / "2.tif", tmp_path / "out", registers=False, smallest_area=0
     )
     assert found["cells"]["risen"] + found["cells"]["fallen"] < 0.02 * SIDE**2
+
+
+def test_change__does_not_take_filled_cells_for_measured_ones(dates, tmp_path):
+    filled = shutil.copy(dates / "before.tif", tmp_path / "filled.tif")
+    with rasterio.open(filled, "r+") as dataset:
+        count = dataset.read(4)
+        count[40:60, 40:60] = 0
+        dataset.write(count, 4)
+    sat_intervals.change(dates / "before.tif", filled, tmp_path / "out", registers=False)
+    assert np.isnan(read_layers(tmp_path / "out" / "change.tif")[0, 41:59, 41:59]).all()
 
 
 def test_change__counts_no_ground_and_unknown_sigma_as_no_data(tmp_path):

@@ -20,7 +20,8 @@ def surface_of(results: Results) -> dict[str, Any] | None:
     if not results.has_current("dsm.tif"):
         return None
     (rows, columns), place = read_place(results.out / "dsm.tif")
-    small = -(-rows // max(1, rows // _CELLS)), -(-columns // max(1, columns // _CELLS))
+    reduction = max(1, max(rows, columns) // _CELLS)
+    small = -(-rows // reduction), -(-columns // reduction)
     height, lower, upper = read_small_layers(results.out / "dsm.tif", small)[:3].astype(np.float64)
     known, half = np.isfinite(height), (upper - lower) / 2
     low, middle, high = np.percentile(height[known], (2, 50, 98)) if known.any() else [float("nan")] * 3
