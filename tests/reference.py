@@ -772,7 +772,8 @@ def filled(height, lower, upper, voids, reach, apart):
         at = tuple(np.transpose(rim))
         z = height[at]
         value = plane[0] if is_smooth else np.sort(z)[1]
-        above = np.mean(upper[at] - z)
+        two = np.argsort(z)[:2]
+        below, above = (max(one.mean(), one[two].mean()) for one in (z - lower[at], upper[at] - z))
         top = value + max(above, 0 if is_smooth else 0.95 * (z.max() - value))
-        result[:, i, j] = value, value - np.mean(z - lower[at]), top
+        result[:, i, j] = value, value - below, top
     return result

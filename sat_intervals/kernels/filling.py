@@ -105,11 +105,15 @@ def filled(height, lower, upper, voids, reach, apart):
             middle, away = _plane(z[: count + behind], x, y)
             is_smooth = away <= apart
             value = middle if is_smooth else z[next_low]
-            below = above = 0.0
+            below = above = below_low = above_low = 0.0  # means over the rim, and over its two lowest
             for k in range(count):
                 row, column = found[k]
+                share = 0.5 * (k in (low, next_low))
                 below += (z[k] - lower[row, column]) / count
                 above += (upper[row, column] - z[k]) / count
+                below_low += share * (z[k] - lower[row, column])
+                above_low += share * (upper[row, column] - z[k])
+            below, above = max(below, below_low), max(above, above_low)
             top = 0.0 if is_smooth else _SHARE * (z[:count].max() - value)
             result[0, i, j], result[1, i, j] = value, value - below
             result[2, i, j] = value + (top if top > above else above)
