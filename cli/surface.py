@@ -53,12 +53,10 @@ def surface(
 
     if sensor_files[1:]:
         raise click.UsageError("give --left-model, --right-model, --left-grid and --right-grid once.")
-    if pair.more:
-        check_absent({"--left-model": sensor_files or None}, "two images")
+    check_absent({"--left-model": (pair.more and sensor_files) or None}, "two images")
     images = pair.open()
     settings.check_kept(out, *(out / name for name in FILES))
-    config = settings.load(len(images))
-    if run.says_job(config, out):
+    if run.says_job(config := settings.load(len(images)), out):
         return
     with run.console() as console:
         done = surface(
@@ -80,5 +78,7 @@ def surface(
     else:
         console.summary(done["run"], out)
         say_surface(console, done["surface"])
-        console.say("\n".join(str(out / name) for name in ("dsm.tif", "ortho.tif")[: 1 + ortho]))
+        console.say(str(out / "dsm.tif"))
+    if ortho:
+        console.say(str(out / "ortho.tif"))
     run.check_strict(done["warnings"])
