@@ -13,6 +13,7 @@ from sat_intervals.heights.point_cloud import Cells
 from sat_intervals.heights.shifts import Fits, aligned, correlations, tilted
 from sat_intervals.heights.stack import Stack, Surface, level_config, ranges_for, samples_of, surface_of
 from sat_intervals.heights.views import common_cells, undulation_at, views_of, with_pairs
+from sat_intervals.kernels.components import component_sizes
 from sat_intervals.match.ground import BLOCK, GroundViews
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.prepare.pair import Each
@@ -22,6 +23,7 @@ from sat_intervals.raster import Projection
 _FACTORS, _LEAST = (512, 128, 32, 8, 2), 48
 # Share of the cells of the coarsest level that are too doubtful for the range of heights: roofs are among the next.
 _DOUBTFUL = 0.1
+_SPECKLE = 3  # cells of one height, at least: stray winners of three images made the range seven times as wide
 # Share of the cells of the coarsest level beyond the range of heights at each end; its margin: steps, and a share.
 _BEYOND, _MARGIN = 0.005, (3, 0.15)
 # Rounds of matching and shifts at a level, and the shifts after which there is no other, in pixels of the level.
@@ -188,7 +190,8 @@ def _factors(cells: Cells) -> list[int]:
 
 def _heights_of(surface: Surface, stack: Stack, domain: tuple[float, float]) -> tuple[float, float]:
     """Return the range of the heights of most cells of a level, in metres."""
-    found = surface.disparity[surface.sure(_DOUBTFUL)]
+    sure = surface.sure(_DOUBTFUL)
+    found = surface.disparity[sure & (component_sizes(surface.disparity, sure) >= _SPECKLE)]
     if not found.size:
         raise SatIntervalsError(
             "nowhere on the grid do two images show the same ground: check the grid, no-data values and masks"

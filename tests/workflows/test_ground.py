@@ -1,6 +1,7 @@
 """What is found before the tiles of a sweep: errors of models, heights, and images that are not of the place."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -42,6 +43,22 @@ def test_found_ground__heights_and_ranges_contain_the_ground(sweep):
     lowest, highest = (base + found["step"] * end for end in (least, most))
     assert ((lowest <= sweep.truth) & (sweep.truth <= highest))[known].mean() > 0.98
     assert (most - least).mean() < 0.8 * (found["disparities"][1] - found["disparities"][0])
+
+
+def test_heights_of__stray_winners_do_not_widen_the_range():
+    from sat_intervals.heights.stack import Surface
+    from sat_intervals.workflows.ground import _heights_of
+
+    random = np.random.default_rng(5)
+    disparity = np.broadcast_to(np.linspace(-5, 5, 60, dtype=np.float32), (60, 60)).copy()
+    disparity[20:28, 20:28] = 40  # a tower
+    rows, columns = np.meshgrid(range(5, 60, 7), range(2, 60, 7))
+    disparity[rows, columns] = random.uniform(-300, 300, rows.shape)  # 2 % of the cells, in twos
+    surface = Surface(disparity.repeat(2, axis=0), np.zeros((120, 60), np.float32))
+    stack = SimpleNamespace(ground=SimpleNamespace(base=10.0, step=0.5))
+    low, high = _heights_of(surface, stack, (-500, 500))
+    assert 0 < low < 7.5
+    assert 30 < high < 40
 
 
 @pytest.mark.parametrize("pixels", [noise, elsewhere])
