@@ -34,9 +34,9 @@ _CELL_OPTIONS = (
     _GRID_OPTIONS[3],
     options.expert_option(
         "--bounds",
-        type=click.Choice(("envelope", "median")),
-        help="Interval of a cell: medians of its points' bounds (default for runs with a coverage), or the envelope of "
-        "their intervals (default for others).",
+        type=click.Choice(("envelope", "quantiles")),
+        help="Interval of a cell: .3 and .7 quantiles of its points' bounds (default for runs with a coverage), or the "
+        "envelope of their intervals (default for others).",
     ),
     options.expert_option(
         "--keep-border",

@@ -21,7 +21,7 @@ from sat_intervals.tiling import Window
 _TILE = 1024  # side of a tile in cells: some hundred megabytes
 # Cells of a strip of tiles, 24 bytes each, a few strips in memory; tiles of wide surfaces have fewer rows.
 _STRIP_CELLS, _LOWEST = 1 << 21, 64
-_LISTED = 1 << 24  # bounds listed for the medians of a tile: 4 bytes each
+_LISTED = 1 << 24  # bounds listed for the quantiles of a tile: 4 bytes each
 _STEPS, _WIDEST = 50, 1000  # widths are counted in steps of 2 cm, up to so many metres
 # Share of the weights below the height of runs that are apart; cells between heights that are.
 _LOW, _APART = 1 / 3, 2.0
@@ -96,7 +96,7 @@ def _strips(
 def _tile_size(clouds: Sequence[PointCloud], cells: Cells, radius: float, choices: SurfaceChoices) -> tuple[int, int]:
     """Return rows and columns of a tile: as large as memory allows, all of the same size."""
     rows, columns = min(_TILE, max(_LOWEST, _STRIP_CELLS // cells.columns)), _TILE
-    if choices.bounds == "median":
+    if choices.bounds == "quantiles":
         reaching = max(1.0, math.pi * (radius / cells.resolution) ** 2)  # cells that a point reaches
         most = _LISTED / reaching * min(cloud.ground.pixel_area for cloud in clouds) / cells.resolution**2
         rows = max(AROUND, min(rows, int(math.sqrt(most))))

@@ -10,7 +10,7 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.polygons import read_areas
 from sat_intervals.raster.completion import Completion
 
-Bounds = Literal["envelope", "median"]
+Bounds = Literal["envelope", "quantiles"]
 BOUNDS: tuple[Bounds, ...] = get_args(Bounds)
 
 
@@ -21,8 +21,9 @@ class SurfaceChoices:
     Attributes
     ----------
     bounds
-        Interval of a cell: ``envelope`` contains those of all its points; ``median`` has the medians of their bounds,
-        and contains the cell's height. None: ``median`` for runs with a coverage, else ``envelope``.
+        Interval of a cell: ``envelope`` contains those of all its points; ``quantiles`` goes from the .3
+        quantile of their lower bounds to the .7 quantile of their upper bounds, and contains the cell's height. None:
+        ``quantiles`` for runs with a coverage, else ``envelope``.
     keeps_open
         Whether points whose interval is open at an end of the search range contribute. None: not with a coverage.
     keeps_border
@@ -75,7 +76,7 @@ class SurfaceChoices:
         covered = all(interval is not None and interval.coverage is not None for interval in intervals)
         return replace(
             self,
-            bounds=self.bounds or ("median" if covered else "envelope"),
+            bounds=self.bounds or ("quantiles" if covered else "envelope"),
             keeps_open=not covered if self.keeps_open is None else self.keeps_open,
         )
 

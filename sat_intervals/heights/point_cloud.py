@@ -14,7 +14,7 @@ import numpy as np
 from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.lattice import WINDOW, Extent, Ground, Lattice, joined
 from sat_intervals.kernels.disparity import median
-from sat_intervals.kernels.gridding import BOUNDED, LOWER, UPPER, empty_cells, gather, mean_heights, medians, splat
+from sat_intervals.kernels.gridding import BOUNDED, LOWER, UPPER, empty_cells, gather, mean_heights, quantiles, splat
 from sat_intervals.products import OPEN_ABOVE, OPEN_BELOW, RANGE_INCOMPLETE, Bands
 from sat_intervals.results import Run
 from sat_intervals.tiling import Grid, Tile, Window
@@ -25,6 +25,9 @@ _NEAR = 2  # pixels around a point whose median outliers are compared with
 _FEW = 1e-4
 _FAR = 20.0
 _TAIL = 0.01
+# Quantile of the bounds of a cell's points, outwards. With medians, surfaces of five pairs contain .77 of the LiDAR
+# heights on slopes from 45 degrees, and .87 of all; with this .81 and .89, at the same interval score.
+_OUTER = 0.7
 _DOUBTFUL = 0.1  # confidence below which points beside missing data of the right image are left out
 _HEIGHT = slice(2, 3)  # the height among the values of a lattice
 
@@ -123,10 +126,10 @@ class PointCloud:
             placed = [column.astype(np.float32).ravel(), row.astype(np.float32).ravel()]
             placed += [values.ravel() for values in points[2:]]
             splat(*placed, reach, gathered)
-            if self.choices.bounds == "median":
+            if self.choices.bounds == "quantiles":
                 near.append(_within(placed[:5], window, max(reach, 0.5)))
-        if self.choices.bounds == "median":
-            _set_medians(gathered, near, reach)
+        if self.choices.bounds == "quantiles":
+            _set_quantiles(gathered, near, reach)
         return gathered, counts
 
     def points(self, window: Window) -> tuple[Points, dict[str, np.ndarray]]:
@@ -172,12 +175,12 @@ def _within(points: Sequence[np.ndarray], window: Window, reach: float) -> tuple
     return tuple(values[inside].astype(np.float32) for values in (column, row, lower, upper))
 
 
-def _set_medians(gathered: np.ndarray, near: Sequence[tuple[np.ndarray, ...]], reach: float) -> None:
-    """Replace the bounds of each cell by the medians over its points, widened to the cell's height."""
+def _set_quantiles(gathered: np.ndarray, near: Sequence[tuple[np.ndarray, ...]], reach: float) -> None:
+    """Replace the bounds of each cell by quantiles over those of its points, widened to the cell's height."""
     height, counts = mean_heights(gathered), gathered[BOUNDED].astype(np.int64)
     firsts = counts.cumsum().reshape(counts.shape) - counts
-    for layer, index, outwards in ((LOWER, 2, np.minimum), (UPPER, 3, np.maximum)):
+    for layer, index, share, outwards in ((LOWER, 2, 1 - _OUTER, np.minimum), (UPPER, 3, _OUTER, np.maximum)):
         bounds, ends = np.empty(counts.sum(), np.float32), firsts.copy()
         for points in near:
             gather(points[0], points[1], points[index], reach, ends, bounds)
-        gathered[layer] = outwards(medians(counts, bounds), height)
+        gathered[layer] = outwards(quantiles(counts, bounds, share), height)

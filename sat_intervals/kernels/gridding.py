@@ -1,4 +1,4 @@
-"""Ground points gathered in the cells of a grid: sums over the points that reach a cell, and medians of their bounds.
+"""Ground points gathered in the cells of a grid: sums over the points that reach a cell, quantiles of their bounds.
 
 Letters: n point; i, j row and column of a cell; u, v column and row of a point, in cells from the first cell's centre.
 """
@@ -99,11 +99,12 @@ def gather(column, row, bound, radius, ends, bounds):
 
 
 @cached
-def medians(counts, bounds):
-    """Median of the bounds of each cell, which are sorted in place: ``(rows, columns)``, NaN without any.
+def quantiles(counts, bounds, share):
+    """Quantile of the bounds of each cell, which are sorted in place: ``(rows, columns)``, NaN without any.
 
     counts: ``(rows, columns)``, the number of bounds of each cell, the layer BOUNDED.
     bounds: ``(total,)``, see `gather`.
+    share: of the bounds that are smaller; between two ranks it is linear.
     """
     rows, columns = counts.shape
     result = np.full((rows, columns), np.nan)
@@ -114,6 +115,9 @@ def medians(counts, bounds):
             if count:
                 own = bounds[first : first + count]
                 _sort(own)
-                result[i, j] = (own[(count - 1) // 2] + own[count // 2]) / 2
+                rank = share * (count - 1)
+                below = int(rank)
+                step = own[min(below + 1, count - 1)] - own[below]
+                result[i, j] = own[below] + step * (rank - below)
                 first += count
     return result

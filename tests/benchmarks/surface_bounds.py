@@ -2,7 +2,7 @@
 
 Towns, slopes and rough ground, at three base-to-height ratios, are matched with a coverage of .90, as four pairs each,
 which see the ground from other sides. Points come from the analytic cameras of the scenes. The envelope keeps open
-intervals, as without a coverage; the median leaves them out. The truth of a cell is the height of the surface, seen
+intervals, as without a coverage; quantiles leave them out. The truth of a cell is the height of the surface, seen
 from above, at its centre. Cells near a wall are apart: heights within one cell of the centre differ by more than 2.2 px
 of disparity, and more than the side of the cell. Matched pairs are kept in `build/surfaces`.
 """
@@ -166,7 +166,7 @@ def compare_bounds(scenes):
 
 def compare_calibrations(scenes):
     table = Table("calibrated on")
-    samples = {scene: cells_of(*scene, 1, "median") for scene in scenes}
+    samples = {scene: cells_of(*scene, 1, "quantiles") for scene in scenes}
     for (kind, ratio, cell), (sample, walls) in samples.items():
         others = [samples[other, ratio, cell][0] for other in KINDS if other != kind]
         by_blocks, by_scenes = held_out(sample, 1.0, 0.9), calibrated(sample, others)
@@ -179,7 +179,7 @@ def compare_pairs(scenes):
     table = Table("pairs")
     for kind, ratio, cell in scenes:
         for pairs in (1, 2, 4):
-            sample, walls = cells_of(kind, ratio, cell, pairs, "median")
+            sample, walls = cells_of(kind, ratio, cell, pairs, "quantiles")
             for label, one in ((f"{pairs}", sample), (f"{pairs}, calibrated", held_out(sample, 1.0, 0.9))):
                 table.add(kind, ratio, cell, label, figures(one, walls, 0.5 / ratio))
     table.end()

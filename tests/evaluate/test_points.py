@@ -11,7 +11,7 @@ from sat_intervals.evaluate.surface_accuracy import evaluate_surface
 from sat_intervals.evaluate.surface_calibration import calibrate_surface
 
 pytestmark = pytest.mark.peer("pyarrow", "pyogrio", "shapely")
-TAGS = {"INTERVAL": "median", "RADIUS": "1 m", "COVERAGE": "0.9", "RUNS": "2026"}
+TAGS = {"INTERVAL": "quantiles", "RADIUS": "1 m", "COVERAGE": "0.9", "RUNS": "2026"}
 TAGS |= {"HEIGHTS": "above the WGS 84 ellipsoid"}
 
 

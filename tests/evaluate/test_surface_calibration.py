@@ -16,7 +16,7 @@ from sat_intervals.evaluate.surface_calibration import calibrate_surface
 
 pytestmark = pytest.mark.usefixtures("thinned")
 
-TAGS = {"INTERVAL": "median", "RADIUS": "1 m", "COVERAGE": "0.9", "RUNS": "2026"}
+TAGS = {"INTERVAL": "quantiles", "RADIUS": "1 m", "COVERAGE": "0.9", "RUNS": "2026"}
 TAGS |= {"HEIGHTS": "above the WGS 84 ellipsoid"}
 
 
@@ -39,7 +39,7 @@ def test_calibrate_surface__widens_narrow_intervals_and_narrows_wide_ones(tmp_pa
     found = calibrate_surface(*scene(tmp_path), "mine", registers=False)
     assert found.coverage == 0.9
     assert found.surface == {
-        "CELL": "1 m", "PAIRS": "1", "INTERVAL": "median", "RADIUS": "1 m", "COVERAGE": "0.9"
+        "CELL": "1 m", "PAIRS": "1", "INTERVAL": "quantiles", "RADIUS": "1 m", "COVERAGE": "0.9"
     }  # fmt: skip
     assert [kind.half_width_below for kind in found.classes] == [0.505, None] * 4
     for narrow, wide in zip(found.classes[::2], found.classes[1::2], strict=True):
@@ -240,7 +240,7 @@ def test_load_height_calibration__what_it_cannot_use_is_one_line(tmp_path):
         assert re.search(f"{file}.*{re.escape(message)}", str(error.value))  # on one line
     file.write_text(yaml.safe_dump(given | {"surface": given["surface"] | {"INTERVAL": "envelope"}}))
     with pytest.raises(
-        SatIntervalsError, match=r"other surfaces, INTERVAL is envelope in the calibration and median in the surface"
+        SatIntervalsError, match=r"other surfaces, INTERVAL is envelope in the calibration and quantiles in the surface"
     ):
         load_height_calibration(file).check_surface(given["surface"])
     assert invoke("match", "a", "b", tmp_path, "--coverage", 0.9, "--calibration", file).stderr.count(

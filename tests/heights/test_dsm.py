@@ -339,7 +339,7 @@ def with_coverage(out, calibration=None):
     return with_settings(out, interval=interval)
 
 
-@pytest.mark.parametrize(("bounds", "expected"), [("envelope", (0, 40)), ("median", (5, 13))])
+@pytest.mark.parametrize(("bounds", "expected"), [("envelope", (0, 40)), ("quantiles", (0.9, 16.15))])
 def test_make_surface__bounds_of_a_cell_worked_example(tmp_path, bounds, expected):
     # Four points at the centre of a cell, of height 10, 11, 11 and 12 (mean 11): 0 to 40, 9.5 to 12.5, 9 to 11, 1 to
     # 13.5. Sorted lower bounds 0, 1, 9, 9.5; upper bounds 11, 12.5, 13.5, 40.
@@ -356,17 +356,17 @@ def test_make_surface__heights_do_not_depend_on_the_bounds(tmp_path, monkeypatch
     x, y = random.uniform(0, 6, (2, 14, 14))
     out = write_points(tmp_path / "a", x, -y, random.normal(100, 5, x.shape))
     wide, _, _ = surface_of([out], tmp_path)
-    narrow, _, _ = surface_of([out], tmp_path, choices=SurfaceChoices(bounds="median"))
+    narrow, _, _ = surface_of([out], tmp_path, choices=SurfaceChoices(bounds="quantiles"))
     assert_array_equal(narrow[0], wide[0])
     filled = np.isfinite(wide[0])
     for smaller, larger in ((wide[1], narrow[1]), (narrow[1], narrow[0]), (narrow[0], narrow[2]), (narrow[2], wide[2])):
         assert (smaller <= larger)[filled].all()
     monkeypatch.setattr("sat_intervals.heights.cells._LISTED", 100)  # small tiles
-    tiled, _, _ = surface_of([out], tmp_path, choices=SurfaceChoices(bounds="median"))
+    tiled, _, _ = surface_of([out], tmp_path, choices=SurfaceChoices(bounds="quantiles"))
     assert_allclose(tiled, narrow, atol=1e-4)
 
 
-def test_make_surface__a_coverage_means_medians_without_open_points(tmp_path):
+def test_make_surface__a_coverage_means_quantiles_without_open_points(tmp_path):
     validity = [[0, 0, OPEN_ABOVE]]
     out = write_points(tmp_path / "a", [0.5] * 3, [-0.5] * 3, [10.0, 14.0, 30.0], validity=validity)
     before, place, report = surface_of([out], tmp_path, radius=0.6)
@@ -374,8 +374,8 @@ def test_make_surface__a_coverage_means_medians_without_open_points(tmp_path):
     assert_allclose(before[:4, i, j], [18, 9, 32, 3])
     assert (report["bounds"], report["open"]) == ("envelope", 0)
     surface, _, report = surface_of([with_coverage(out)], tmp_path, radius=0.6)
-    assert_allclose(surface[:4, i, j], [12, 11, 14, 2])
-    assert (report["bounds"], report["open"], report["median_half_width"]) == ("median", 1, 1.5)
+    assert_allclose(surface[:4, i, j], [12, 10.2, 14.8, 2])
+    assert (report["bounds"], report["open"], report["median_half_width"]) == ("quantiles", 1, pytest.approx(2.3))
 
 
 def test_make_surface__outliers_are_left_out_and_counted(tmp_path):
@@ -406,7 +406,7 @@ version: 2
 name: city
 coverage: 0.8
 registered: true
-surface: {CELL: 1 m, PAIRS: '1', INTERVAL: median, RADIUS: 0.6 m, COVERAGE: '0.9', OPEN_POINTS: left out}
+surface: {CELL: 1 m, PAIRS: '1', INTERVAL: quantiles, RADIUS: 0.6 m, COVERAGE: '0.9', OPEN_POINTS: left out}
 classes:
 - {relief_below: 5.0, half_width_below: 2.5, margin: 0.75, cells: 100}
 - {relief_below: 5.0, half_width_below: null, margin: -4.0, cells: 100}
@@ -422,7 +422,7 @@ def test_dsm_command__a_calibration_moves_the_bounds_and_is_named_in_the_file(tm
     words = ["dsm", str(with_coverage(out)), "--resolution", "1", "--radius", "0.6", "--calibration", str(file)]
     result = invoke(*words, "--max-width", "6")
     assert result.exit_code == 0, result.stderr
-    assert "by --bounds median, calibration city" in result.stdout
+    assert "by --bounds quantiles, calibration city" in result.stdout
     with rasterio.open(out / "dsm.tif") as dataset:
         (surface, place), tags = (dataset.read(), dataset.transform), dataset.tags()
     i, j = cell_of(place, LEFT, TOP)
@@ -437,7 +437,7 @@ def test_dsm_command__a_calibration_moves_the_bounds_and_is_named_in_the_file(tm
         assert dataset.tags()["CALIBRATION"] != tags["CALIBRATION"]
     for changes, message in (
         (["--resolution", "2"], "other surfaces, CELL is 1 m in the calibration and 2 m in the surface: make one with"),
-        (["--bounds", "envelope"], "INTERVAL is median in the calibration and envelope in the surface"),
+        (["--bounds", "envelope"], "INTERVAL is quantiles in the calibration and envelope in the surface"),
         (["--radius", "1"], "RADIUS is 0.6 m in the calibration and 1 m in the surface"),
         (["--outliers", "9"], "OUTLIERS is null in the calibration and 9 m in the surface"),
         (["--calibration", str(tmp_path / "none.yaml")], "No such file or directory: make one with"),
