@@ -94,8 +94,8 @@ def _explained(error: Exception) -> tuple[int, str]:
     from sat_intervals.errors import RunError, SatIntervalsError
 
     if isinstance(error, SatIntervalsError):
-        is_full = getattr(error.__cause__, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
-        return FAILED if isinstance(error, RunError) or is_full else USER_ERROR, str(error)
+        is_failed = getattr(error.__cause__, "errno", None) in (errno.ENOSPC, errno.EDQUOT, errno.EIO)
+        return FAILED if isinstance(error, RunError) or is_failed else USER_ERROR, str(error)
     if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
         return FAILED, f"not enough memory: choose a smaller --tile-size or fewer --workers ({error})"
     if isinstance(error, OSError) and error.strerror:

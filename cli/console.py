@@ -50,7 +50,7 @@ _MADE_FROM_RUNS = ("points.tif", "dsm.tif", "report.html", "project.qgz", "stac.
 
 def _is_older(file: Path, other: Path) -> bool:
     """Return whether a file exists and was written before another one."""
-    return file.exists() and other.exists() and file.stat().st_mtime_ns < other.stat().st_mtime_ns
+    return file.exists() and other.exists() and file.stat().st_mtime < other.stat().st_mtime
 
 
 class Console:

@@ -73,9 +73,10 @@ def logged(debug: bool, log_file: Path | None) -> Iterator[None]:
             stack.enter_context(_added(handler, ours))
             if not dasks.propagate:
                 stack.enter_context(_added(handler, dasks))
-        if everything:
-            stack.callback(ours.setLevel, ours.level)
-            ours.setLevel(logging.DEBUG)
+        # what aiohttp leaves to asyncio of a lost connection is raised, too
+        logger, level = (ours, logging.DEBUG) if everything else (logging.getLogger("asyncio"), logging.CRITICAL)
+        stack.callback(logger.setLevel, logger.level)
+        logger.setLevel(level)
         name, began = click.get_current_context().command_path, time.monotonic()
         _LOG.info("%s begins", name)
         try:
@@ -111,7 +112,7 @@ def _opened(log_file: Path) -> Iterator[IO[str]]:
 
     given = {**click.get_current_context().params, "log_file": None}.values()
     names = [name for value in given for name in (value if isinstance(value, tuple) else (value,))]
-    check_not_replaced([Path(name) for name in names if isinstance(name, (str, Path))], [log_file])
+    check_not_replaced([name for name in names if isinstance(name, (str, Path))], [log_file])
     try:
         file = open(log_file, "a", encoding="utf-8", errors="backslashreplace", buffering=1)  # noqa: SIM115
     except OSError as error:

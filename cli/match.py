@@ -15,7 +15,7 @@ from sat_intervals.cli.options import FILE, Grouped
 @click.argument("out", type=FILE)
 @run_options
 def match(pair: PairArguments, out: Path, settings: SettingsArguments, run: RunArguments) -> None:
-    """Match the epipolar images LEFT and RIGHT and write to the folder OUT.
+    """Match the epipolar images LEFT and RIGHT and write to the folder OUT, which may be in a bucket: s3://bucket/run.
 
     \b
     OUT/intervals.tif   disparity, lower and upper bound (pixels), confidence
@@ -26,6 +26,7 @@ def match(pair: PairArguments, out: Path, settings: SettingsArguments, run: RunA
     rerun the same command.
     """  # noqa: D301 (click's mark of a preformatted paragraph)
     from sat_intervals.cli.logs import warn
+    from sat_intervals.raster import path_of
 
     config = settings.load()
     if run.says_job(config, out):
@@ -36,6 +37,6 @@ def match(pair: PairArguments, out: Path, settings: SettingsArguments, run: RunA
         report = run.match(left, right, out, config, window=pair.window, progress=console.progress)
     run.say(report)
     console.summary(report, out, then="report")
-    if out.resolve() in (Path(image).parent.resolve() for image in (pair.left, pair.right)):
+    if out.resolve() in (path_of(image).parent.resolve() for image in (pair.left, pair.right)):
         warn([f"{out} also holds the images: write to another folder"])
     run.check_strict(report["warnings"])

@@ -62,8 +62,9 @@ class RunArguments(Printing):  # type: ignore[misc,unused-ignore]
         """Print the job script of the cluster if nothing else is to be done."""
         if self.dry_run:
             from sat_intervals.run.batch_system import job_script
+            from sat_intervals.run.state import with_store
 
-            click.echo(job_script(config.cluster, out))
+            click.echo(job_script(with_store(config.cluster, out), out))
         return self.dry_run
 
     def match(

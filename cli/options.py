@@ -58,7 +58,13 @@ class _Name(click.ParamType):  # type: ignore[type-arg,unused-ignore]
     def convert(self, value: Any, parameter: click.Parameter | None, context: click.Context | None) -> Any:
         if value == "":
             self.fail("it is empty: give a file or folder", parameter, context)
-        return Path(value) if self._is_path else value
+        if not self._is_path:
+            return value
+        if "/vsi" not in (text := str(value)) and "://" not in text:
+            return Path(value)
+        from sat_intervals.raster import path_of  # fsspec takes a while
+
+        return path_of(value)
 
     def shell_complete(
         self, context: click.Context, parameter: click.Parameter, incomplete: str

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 REPORT = "sat_intervals.report"
@@ -25,10 +26,14 @@ class ChangedInputError(RunError):
 
 
 def check_file(path: str | os.PathLike[str], remedy: str) -> None:
-    """Raise if a path is no file: it is missing, or a folder."""
-    if not os.path.isfile(path):
-        reason = "is a folder" if os.path.isdir(path) else "no such file"
-        raise SatIntervalsError(f"{os.fspath(path)}: {reason}: {remedy}")
+    """Raise if a path, which may be in a bucket, is no file: it is missing, or a folder."""
+    file = path if isinstance(path, Path) else Path(path)
+    try:
+        reason = None if file.is_file() else "is a folder" if file.is_dir() else "no such file"
+    except OSError as error:
+        reason = error.strerror
+    if reason:
+        raise SatIntervalsError(f"{file}: {reason}: {remedy}")
 
 
 def check_absent(options: Mapping[str, Any], whose: str, place: str = "") -> None:

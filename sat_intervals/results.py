@@ -14,7 +14,7 @@ from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.kernels.row_offsets import RowOffsets
 from sat_intervals.products import BANDS, REGULARIZED, Bands
-from sat_intervals.raster import Georeferencing, Image, check_not_replaced, open_image, read_layers, read_tags
+from sat_intervals.raster import Georeferencing, Image, check_not_replaced, open_image, path_of, read_layers, read_tags
 from sat_intervals.raster.identity import absolute_in, identities
 from sat_intervals.raster.images import opened
 from sat_intervals.raster.layers import is_surface_of, tags_beside
@@ -108,7 +108,7 @@ class Run:
     @property
     def truth_beside(self) -> Path:
         """Return the default path of the truth, ``truth.tif`` beside the left image."""
-        return Path(self.report["inputs"]["left"]["path"]).parent / "truth.tif"
+        return path_of(self.report["inputs"]["left"]["path"]).parent / "truth.tif"
 
     def read_bands(self, window: Window) -> Bands:
         """Read the bands of a window of the results."""
@@ -213,7 +213,7 @@ class Results(Run):
 
 def open_run(out: str | Path) -> Run:
     """Open the folder of a finished run: its two rasters and ``run.json``. Images are not needed."""
-    file = Path(out) / "run.json"
+    file = path_of(out) / "run.json"
     try:
         report = json.loads(file.read_bytes())
         region = Window(**report["tiles"]["region"])
@@ -237,7 +237,7 @@ def open_run(out: str | Path) -> Run:
 
 def read_change(out: str | Path) -> dict[str, Any] | None:
     """Return the content of ``change.json`` of a folder; None without the file, or if the folder has a run."""
-    file = Path(out) / "change.json"
+    file = path_of(out) / "change.json"
     try:
         return None if file.with_name("run.json").exists() else dict(json.loads(file.read_bytes()))
     except FileNotFoundError:

@@ -64,7 +64,7 @@ OVER_THE_LIMITS = {
 LAWS = {
     "./architecture", "./documents", "./package", "./release", "cli/commands", "cli/coverage", "cli/messages",
     "interop/otb", "match/accuracy", "match/pandora", "raster/raster", "run/damage", "run/kept_files",
-    "run/row_warnings", "run/survival", "run/waits", "show/pictures", "store/remote",
+    "run/row_warnings", "run/survival", "run/waits", "show/pictures",
 }  # fmt: skip
 
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())

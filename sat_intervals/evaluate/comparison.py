@@ -14,9 +14,15 @@ from sat_intervals.heights.point_files import ENDINGS
 from sat_intervals.kernels.conformal import AROUND, relief_of
 from sat_intervals.kernels.registration import REACH, Blocks, every_nth, put_together, register, spread_blocks
 from sat_intervals.kernels.relief import sampled
-from sat_intervals.raster import GROUND, Georeferencing, read_heights, read_layers, read_place, read_tags, surface_place
+from sat_intervals.raster import GROUND, Georeferencing, path_of, read_heights, read_layers, read_place, read_tags
 from sat_intervals.raster.heightfield import warn_of_no_data
-from sat_intervals.raster.surfaces import check_reference, covered_window, datum_warnings, resolution_of
+from sat_intervals.raster.surfaces import (
+    check_reference,
+    covered_window,
+    datum_warnings,
+    resolution_of,
+    surface_place,
+)
 from sat_intervals.tiling import Grid, Window
 
 _TILE = 1 << 20  # heights compared at a time, some hundred bytes each
@@ -104,7 +110,7 @@ def open_comparison(
     sigma: float | None = None,
 ) -> Comparison:
     """Open a surface model and its reference, which a registration moves; ``sigma`` is that of points."""
-    surface, reference = Path(surface), Path(reference)
+    surface, reference = path_of(surface), path_of(reference)
     shape, place = surface_place(surface)
     if reference.suffix.lower() in ENDINGS:
         points = read_points(surface, reference, place, shape, sigma)

@@ -18,7 +18,7 @@ from sat_intervals.evaluate.comparison import (
     tiles,
 )
 from sat_intervals.evaluate.points import summary_of
-from sat_intervals.raster import read_heights, read_layers, read_place, read_small_layers, read_tags
+from sat_intervals.raster import path_of, read_heights, read_layers, read_place, read_small_layers, read_tags
 from sat_intervals.tiling import Window
 
 # Limits of classes: slope of the reference in degrees, half width of the interval in metres.
@@ -135,13 +135,13 @@ def evaluate_surface(
     nominal_is = next((name for name in ("coverage", "alpha") if name.upper() in tags), None)
     nominal = float(tags[nominal_is.upper()]) if nominal_is else None
     if classes is not None:
-        read_place(Path(classes))
+        read_place(path_of(classes))
     moved, warnings = registered(given) if registers else (given, [])
     is_noisy = given.points is not None and bool(given.points[:, 3].any())
     judging: dict[str, Any] = {"nominal": nominal, "within": within, "is_noisy": is_noisy}
     before, figures = Accuracy(**judging), _Figures(**judging)
     for window in tiles(given):
-        figures.add(moved, window, None if classes is None else Path(classes))
+        figures.add(moved, window, None if classes is None else path_of(classes))
         if moved is not given:
             cells, _, missing = compared(given, window)
             before.add(cells, missing[0].size)

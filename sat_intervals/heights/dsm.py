@@ -20,7 +20,7 @@ from sat_intervals.heights.rectify import raw_inputs
 from sat_intervals.machine import usable_cores
 from sat_intervals.products import ORTHO
 from sat_intervals.progress import Progress
-from sat_intervals.raster import OutputWriter, Projection, files_of, north_up, read_place, surface_file, utm_of
+from sat_intervals.raster import OutputWriter, Projection, files_of, north_up, path_of, read_place, surface_file, utm_of
 from sat_intervals.raster.completion import Completion, complete
 from sat_intervals.raster.georeferencing import horizontal_name
 from sat_intervals.raster.heightfield import warn_of_no_data
@@ -87,7 +87,7 @@ def make_surface(
         A run has no models and grids, or none that fit, no cell has a height, the CRS or the grid cannot be used, or
         the file cannot be written.
     """
-    path, geoid, choices = Path(path), None if geoid is None else Path(geoid), choices or SurfaceChoices()
+    path, geoid, choices = path_of(path), None if geoid is None else path_of(geoid), choices or SurfaceChoices()
     given = [geoid, choices.flatten, choices.mask, *_files_of(choices.reference), *_files_of(resolution)]
     grid, resolution, crs, radius = checked_cells(resolution, crs, radius, geoid)
     completion = completion_of(resolution, choices.fill, choices.flatten, choices.mask)
@@ -209,7 +209,7 @@ def check_sensors(files: Sequence[str | Path], resolution: float | Path, crs: st
     """Raise before hours of matching if models or grids cannot be read, or pixels have too many cells."""
     from sat_intervals.heights.sensors import Sensors, lattice_of
 
-    sensors = Sensors.load(*map(Path, files))
+    sensors = Sensors.load(*map(path_of, files))
     column, row = (int(nodes[nodes.size // 2]) for nodes in sensors.left_grid.points)
     lattice = lattice_of(sensors, Window(row, column, 2, 2), 0, 1)
     if isinstance(resolution, Path) or not np.isfinite(lattice.nodes).all():

@@ -13,7 +13,7 @@ import numpy as np
 from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.heights.models import SensorImage, common_heights, common_parts, read_with
 from sat_intervals.kernels.compiled import kernels_of_others
-from sat_intervals.raster import Georeferencing, ground_of, write_layer
+from sat_intervals.raster import Georeferencing, ground_of, path_of, write_layer
 from sat_intervals.tiling import Window
 
 with kernels_of_others():
@@ -231,10 +231,10 @@ def _dem(left: SensorImage, right: SensorImage, nodes: np.ndarray, terrain: Terr
     """Return the DEM around all left nodes, which shareloc follows, or its only height; raise if it is smaller."""
     dem, geoid = str(terrain.dem), terrain.geoid and str(terrain.geoid)
     ground = left.model.direct_loc_h(*nodes[:: len(nodes) - 1].reshape(-1, 2).T, height)[:, :2]
-    heights, place = ground_of(Path(dem), (*ground.min(axis=0), *ground.max(axis=0)), _AROUND)
+    heights, place = ground_of(path_of(dem), (*ground.min(axis=0), *ground.max(axis=0)), _AROUND)
     with TemporaryDirectory() as folder:  # shareloc takes places of a projected DEM for degrees
         write_layer(file := Path(folder) / "dem.tif", heights, np.nan, place)
-        read = read_with(Path(dem), "DEM", lambda _: dtm_reader(str(file), geoid))
+        read = read_with(path_of(dem), "DEM", lambda _: dtm_reader(str(file), geoid))
     if not np.isfinite(read.alt_data).all():
         given = f"{dem} with {geoid}" if geoid else dem
         raise SatIntervalsError(f"{given} has no heights at a part of the images: give files that cover them")

@@ -1,7 +1,7 @@
 """Sensor models and epipolar grids of a run: given once, then named by ``geometry.json`` in its folder."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +12,7 @@ from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.heights.lattice import Lattice
 from sat_intervals.heights.rectify import rectified_files
 from sat_intervals.progress import Progress
+from sat_intervals.raster import path_of
 from sat_intervals.raster.identity import absolute_in, identity, local_file, relative_in
 from sat_intervals.raster.publishing import write_record
 from sat_intervals.results import Run, open_run
@@ -67,7 +68,7 @@ def set_geometry(
     """
     run = out if isinstance(out, Run) else open_run(out)
     run.check_pair()
-    paths = [Path(file) for file in (left_model, right_model, left_grid, right_grid)]
+    paths = [path_of(file) for file in (left_model, right_model, left_grid, right_grid)]
     run.check_kept([run.out / FILE], paths)
     _, report = _sensors(run, paths)
     known = {kind: identity(str(path)) for kind, path in zip(_KINDS, paths, strict=True)}
@@ -84,7 +85,7 @@ def geometry_of(run: Run, progress: Progress = lambda stage, done, total: None) 
     images = [run.report["inputs"][side] for side in ("left", "right")]
     if not (run.out / FILE).exists() and (made := rectified_files(*(image["path"] for image in images))):
         for image in images:
-            if identity(image["path"], {image["path"]: image}).get("sha256") != image.get("sha256"):
+            if _content(identity(image["path"], {image["path"]: image})) != _content(image):
                 raise SatIntervalsError(
                     f"{image['path']} was rectified again since {run.out} was made: match it again with --overwrite"
                 )
@@ -108,9 +109,14 @@ def _sensors(run: Run, paths: Sequence[Path]) -> "tuple[Sensors, dict[str, float
     return sensors, fit | _beyond(sensors.left_grid, run)
 
 
+def _content(record: Mapping[str, Any]) -> Any:
+    """Return what tells the content of a file from others: SHA-256, or ETag in a bucket; None without."""
+    return record.get("sha256", record.get("etag"))
+
+
 def _images(run: Run) -> list[str]:
     """Return what tells the images of a run from others."""
-    return [image.get("sha256", image["path"]) for image in map(run.report["inputs"].get, ("left", "right"))]
+    return [_content(image) or image["path"] for image in map(run.report["inputs"].get, ("left", "right"))]
 
 
 def _noted(run: Run) -> list[Path]:
@@ -127,10 +133,10 @@ def _noted(run: Run) -> list[Path]:
     if images != _images(run):
         raise SatIntervalsError(f"{file} is of other images than {run.out} now: {_GIVE}")
     for path, record in zip(paths, known, strict=True):
-        check_file(local_file(path) or path, _GIVE)
-        if identity(path, {path: record}).get("sha256") != record.get("sha256"):
+        check_file(local_file(path) or path_of(path), _GIVE)
+        if _content(identity(path, {path: record})) != _content(record):
             raise SatIntervalsError(f"{path} has changed since {file} was written: {_GIVE}")
-    return [Path(path) for path in paths]
+    return [path_of(path) for path in paths]
 
 
 def _beyond(grid: Any, run: Run) -> dict[str, float]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.kernels.compiled import kernels_of_others
-from sat_intervals.raster import Image, between_180, find_model, read_rpc_file
+from sat_intervals.raster import Image, between_180, find_model, path_of, read_rpc_file
 from sat_intervals.raster.identity import local_file
 from sat_intervals.raster.rpc import local_copy
 from sat_intervals.tiling import Window
@@ -41,12 +41,12 @@ def read_model(path: str | Path) -> Any:
     """Read an RPC model: a raster that GDAL finds one for, a text of coefficients, ``.geom`` or DIMAP XML."""
 
     def read(name: str) -> Any:
+        if found := read_rpc_file(name):
+            return RPC(convert_rio_rpc_to_rpc_dict(found))
         with TemporaryDirectory() as folder:
-            file = local_copy(name, folder)
-            found = read_rpc_file(file)
-            return GeoModel(file) if found is None else RPC(convert_rio_rpc_to_rpc_dict(found))
+            return GeoModel(local_copy(name, folder))
 
-    model = read_with(Path(path), "RPC model", read)
+    model = read_with(path_of(path), "RPC model", read)
     if abs(model.offset_x) > 180:  # GDAL takes 245 E for 115 W, shareloc does not
         model.offset_x = between_180(model.offset_x)
     return model

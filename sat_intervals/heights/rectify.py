@@ -13,7 +13,7 @@ import numpy as np
 from sat_intervals.errors import ChangedInputError, SatIntervalsError, check_file
 from sat_intervals.products import Band, plain
 from sat_intervals.progress import Progress
-from sat_intervals.raster import File, Georeferencing, Image, OutputWriter, check_not_replaced, describe
+from sat_intervals.raster import File, Georeferencing, Image, OutputWriter, check_not_replaced, describe, path_of
 from sat_intervals.raster.identity import absolute_in, identities, identity, relative_in
 from sat_intervals.raster.publishing import check_free, write_record
 from sat_intervals.results import open_input
@@ -179,15 +179,15 @@ def read_record(folder: Path) -> dict[str, Any] | None:
 
 def rectified_files(left: str | Path, right: str | Path) -> tuple[Path, Path, Path, Path] | None:
     """Return models and grids of an epipolar pair that `rectify` has made; None if it has not."""
-    folder = Path(left).parent
-    if Path(right).parent != folder or (Path(left).name, Path(right).name) != IMAGES:
+    (left, right), folder = map(path_of, (left, right)), path_of(left).parent
+    if right.parent != folder or (left.name, right.name) != IMAGES:
         return None
     record = read_record(folder)
     if record is None:
         return None
     if not record["finished"]:
         raise SatIntervalsError(f"{folder} holds an unfinished pair: rerun rectify")
-    left_model, right_model = (Path(record["inputs"][f"{side}_model"]["path"]) for side in ("left", "right"))
+    left_model, right_model = (path_of(record["inputs"][f"{side}_model"]["path"]) for side in ("left", "right"))
     return left_model, right_model, folder / GRIDS[0], folder / GRIDS[1]
 
 
@@ -197,8 +197,8 @@ def raw_inputs(left: str | Path, right: str | Path) -> dict[str, Any]:
         raise SatIntervalsError(
             f"{left} was not rectified by sat-intervals, so its raw image is unknown: leave out ortho"
         )
-    inputs = dict((read_record(Path(left).parent) or {})["inputs"])
+    inputs = dict((read_record(path_of(left).parent) or {})["inputs"])
     for side in ("left", "right"):
         open_input(inputs[side])  # raises if it is missing
-        check_file(Path(inputs[f"{side}_model"]["path"]), "its model is needed for an ortho-image")
+        check_file(path_of(inputs[f"{side}_model"]["path"]), "its model is needed for an ortho-image")
     return inputs

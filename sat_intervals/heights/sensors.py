@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from sat_intervals.kernels.compiled import kernels_of_others
 from sat_intervals.kernels.row_offsets import RowOffsets
 from sat_intervals.progress import Progress
 from sat_intervals.raster import GROUND, Georeferencing, between_180, read_known, read_tags
+from sat_intervals.raster.rpc import local_copy
 from sat_intervals.tiling import Window
 
 try:
@@ -106,7 +108,9 @@ def read_grid(path: Path, left: Georeferencing) -> RectificationGrid:
     Grids of OTB have displacements from epipolar coordinates, for both images those of pixels in the georeferencing
     ``left`` of the whole left epipolar image.
     """
-    grid = RectificationGrid(str(path))
+    with TemporaryDirectory() as folder:
+        grid = RectificationGrid(local_copy(str(path), folder, ends=("",)))
+    grid.grid_filename = str(path)
     has_displacements = read_tags(path).get(_TAG) == _OTB
     columns, rows = grid.points
     nodes = np.stack(np.meshgrid(columns, rows, indexing="ij"), axis=-1)

@@ -14,7 +14,7 @@ from sat_intervals.heights.lattice import WINDOW, Lattice, on_map
 from sat_intervals.heights.point_cloud import PointCloud
 from sat_intervals.products import Bands
 from sat_intervals.progress import Progress
-from sat_intervals.raster import Layer, OutputWriter, Projection, between_180, new_file, points_file, utm_of
+from sat_intervals.raster import Layer, OutputWriter, Projection, between_180, new_file, path_of, points_file, utm_of
 from sat_intervals.results import Run, open_input, open_run
 from sat_intervals.tiling import Grid, Window
 
@@ -50,7 +50,7 @@ def triangulate(
     the figures of `set_geometry`, and ``lost``, the share of the region where grids or models have no values.
     """
     run = out if isinstance(out, Run) else open_run(out)
-    path = run.out / "points.tif" if path is None else Path(path)
+    path = run.out / "points.tif" if path is None else path_of(path)
     if path.suffix.lower() not in _ENDINGS:
         raise SatIntervalsError(f"{path}: give a name that ends with {', '.join(_ENDINGS)}")
     geometry = geometry_of(run, progress)

@@ -13,7 +13,7 @@ from sat_intervals.heights.lattice import Extent, joined
 from sat_intervals.heights.models import SensorImage
 from sat_intervals.heights.point_cloud import Cells
 from sat_intervals.match.ground import BLOCK, FEWEST, GroundViews
-from sat_intervals.raster import Image, Projection, acquired, between_180, find_model
+from sat_intervals.raster import Image, Projection, acquired, between_180, find_model, path_of
 from sat_intervals.tiling import Window
 
 # Nodes along an image at which other images are looked for, and heights.
@@ -34,7 +34,7 @@ def sensors_of(images: Sequence[Image], models: Sequence[str | Path | None]) -> 
         if not model and find_model(one.path) is None:
             raise SatIntervalsError(f"{one.path} has no RPC model in its tags or beside it: give an image with one")
     readings = [
-        SensorImage.readings(one, Path(model) if model else None) for one, model in zip(images, given, strict=False)
+        SensorImage.readings(one, path_of(model) if model else None) for one, model in zip(images, given, strict=False)
     ]
     first = read_with_ground(readings[0], readings[1], is_needed=False)[0]
     return [first, *(read_with_ground([first], others, is_needed=False)[1] for others in readings[1:])]

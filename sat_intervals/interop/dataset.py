@@ -11,10 +11,10 @@ from xarray.core import indexing
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import FLAGS, INVALID, WIDTH, flag_attributes
-from sat_intervals.raster import File, Georeferencing, read_layers, read_tags, run_files, surface_file, surface_place
+from sat_intervals.raster import File, Georeferencing, path_of, read_layers, read_tags, run_files, surface_file
 from sat_intervals.raster.files import change_file
 from sat_intervals.raster.projection import grid_mapping
-from sat_intervals.raster.surfaces import is_change, read_place
+from sat_intervals.raster.surfaces import is_change, read_place, surface_place
 from sat_intervals.results import open_run
 from sat_intervals.tiling import Window
 
@@ -50,7 +50,7 @@ def open(out: str | Path, chunks: int | None = 2048) -> xr.Dataset:
     Parameters
     ----------
     out
-        Folder of the finished run. Its images are not needed.
+        Folder of the finished run, also in a bucket (``s3://bucket/run``). Its images are not needed.
     chunks
         Rows and columns of a dask chunk, best a multiple of 512; None for arrays that are read when they are used.
 
@@ -110,7 +110,7 @@ def open_surface(path: str | Path, chunks: int | None = 2048) -> xr.Dataset:
     SatIntervalsError
         The file cannot be read, or is no such file of this package.
     """
-    file = Path(path)
+    file = path_of(path)
     changes = is_change(file)
     if not changes:
         surface_place(file)

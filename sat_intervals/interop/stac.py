@@ -13,7 +13,7 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import SURFACE, SURFACE_OF_SWEEP, Band, interval_bands
-from sat_intervals.raster import acquired, footprint, read_layers, read_place, read_tags
+from sat_intervals.raster import RemotePath, acquired, footprint, path_of, read_layers, read_place, read_tags
 from sat_intervals.raster.publishing import write_record
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import strips
@@ -47,13 +47,13 @@ def write_item(out: str | Path, *, taken: str | None = None, identifier: str | N
 def _times(run: Run, taken: str | None) -> dict[str, str | None]:
     """Return when the left image was taken, as STAC wants it, or the first and the last image of a sweep."""
     if run.is_sweep and taken is None:
-        paths = [Path(one["path"]) for one in run.images.values()]
+        paths = [path_of(one["path"]) for one in run.images.values()]
         days = [acquired(str(path)) if path.is_file() else None for path in paths]
         known = sorted(f"{day:%Y-%m-%d}" for day in days if day)
         if len(known) == len(days):
             first, last = f"{known[0]}T00:00:00Z", f"{known[-1]}T23:59:59Z"
             return {"datetime": None, "start_datetime": first, "end_datetime": last}
-    image = Path(run.report["inputs"]["left"]["path"])
+    image = path_of(run.report["inputs"]["left"]["path"])
     if taken is None and image.is_file() and (tag := read_tags(image).get("TIFFTAG_DATETIME")):
         with suppress(ValueError):
             taken = datetime.strptime(tag, "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC).isoformat()
@@ -136,7 +136,7 @@ def _cut(ring: list[list[float]], meridian: float, side: int) -> list[list[float
 def _link(run: Run, title: str, record: dict[str, Any]) -> dict[str, str]:
     """Return the link to an image: a local file relative to the folder, any other name as it is."""
     href = record["path"]
-    if Path(href).exists():
+    if Path(href).exists() and not isinstance(run.out, RemotePath):
         href = Path(os.path.relpath(href, run.out.resolve())).as_posix()
     checksum = {"file:checksum": _SHA256 + record["sha256"]} if record.get("sha256") else {}
     return {"rel": "derived_from", "href": href, "title": title} | checksum

@@ -22,13 +22,15 @@ from sat_intervals.raster.windows import (
     read_window,
 )
 from sat_intervals.raster.writer import OutputWriter
+from sat_intervals.store.remote import RemotePath, path_of
 
 __all__ = [
-    "BLOCK", "GROUND", "RUN_FILES", "File", "Frame", "Georeferencing", "HeightRaster", "Image", "Layer", "OutputError",
-    "OutputWriter", "Part", "Projection", "Vertical", "acquired", "as_json", "between_180", "check_free",
-    "check_not_replaced", "check_pair", "check_space", "codec_versions", "compressed", "describe", "factors",
-    "file_bytes", "files_of", "find_model", "fitted_rpc", "footprint", "ground_of", "halved", "is_ground", "new_file",
-    "north_up", "open_image", "part_bytes", "points_file", "ranges_file", "read_heights", "read_known", "read_layers",
-    "read_place", "read_reduced", "read_reduced_views", "read_rpc_file", "read_shape", "read_small_layers", "read_tags",
-    "read_views", "read_window", "run_files", "surface_file", "surface_place", "truth_file", "utm_of", "write_layer",
+    "BLOCK", "GROUND", "RUN_FILES", "File", "Frame", "Georeferencing", "HeightRaster", "Image", "Layer",
+    "OutputError", "OutputWriter", "Part", "Projection", "RemotePath", "Vertical", "acquired", "as_json",
+    "between_180", "check_free", "check_not_replaced", "check_pair", "check_space", "codec_versions", "compressed",
+    "describe", "factors", "file_bytes", "files_of", "find_model", "fitted_rpc", "footprint", "ground_of", "halved",
+    "is_ground", "new_file", "north_up", "open_image", "part_bytes", "path_of", "points_file", "ranges_file",
+    "read_heights", "read_known", "read_layers", "read_place", "read_reduced", "read_reduced_views",
+    "read_rpc_file", "read_shape", "read_small_layers", "read_tags", "read_views", "read_window", "run_files",
+    "surface_file", "surface_place", "truth_file", "utm_of", "write_layer",
 ]  # fmt: skip

@@ -17,6 +17,7 @@ from sat_intervals.raster.images import opened
 from sat_intervals.raster.layers import read_layers
 from sat_intervals.raster.projection import transformed
 from sat_intervals.raster.surfaces import is_change, read_heights, read_place, resolution_of
+from sat_intervals.store.remote import path_of
 from sat_intervals.tiling import Window
 
 _COVERAGE = 0.9  # of bounds that are made of standard deviations
@@ -83,7 +84,7 @@ def _sigma_of(path: Path, window: Window, band: int) -> np.ndarray:
 
 def open_epoch(path: str | Path, sigma: float | None = None) -> Epoch:
     """Open a surface model, or the folder that has it as dsm.tif; ``sigma`` in metres is for those without bounds."""
-    path = Path(path) / "dsm.tif" if Path(path).is_dir() else Path(path)
+    path = path_of(path) / "dsm.tif" if path_of(path).is_dir() else path_of(path)
     shape, place = read_place(path)
     assert place.crs is not None
     if not place.crs.is_projected or place.crs.linear_units_factor[1] != 1:

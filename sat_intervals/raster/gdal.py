@@ -39,6 +39,7 @@ _STRICT = {
     "VRT_NUM_THREADS": "1",
     "GDAL_PNG_WHOLE_IMAGE_OPTIM": "NO",  # reads what is missing from memory that was never written
 }
+_ENDPOINTS = "AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL"  # for fsspec
 # A source of a VRT that cannot be opened fails without a message in each other dataset until the first is closed.
 _OF_SOURCES = threading.RLock()
 
@@ -48,10 +49,19 @@ def reading(path: str, **options: Any) -> Iterator[DatasetReader]:
     """Open a raster for reading; thread-safe. Only one thread of a process reads VRTs."""
     _accept_no_georeferencing()
     # rasterio casts the no-data value to the type: -1.8e308, of ArcGIS, overflows float32
-    with Env(**_STRICT), np.errstate(over="ignore"):
+    with Env(**_STRICT, **_server()), np.errstate(over="ignore"):
         dataset = DatasetReader(path, **options)
         with _OF_SOURCES if dataset.driver == "VRT" else nullcontext(), dataset:
             yield dataset
+
+
+def _server() -> dict[str, str]:
+    """Return GDAL's options for the S3 server that fsspec asks."""
+    scheme, _, address = next(filter(None, map(os.environ.get, _ENDPOINTS)), "").partition("://")
+    if not address or "AWS_S3_ENDPOINT" in os.environ:
+        return {}
+    hosting = os.environ.get("AWS_VIRTUAL_HOSTING", "FALSE")
+    return {"AWS_S3_ENDPOINT": address.rstrip("/"), "AWS_HTTPS": str(scheme != "http"), "AWS_VIRTUAL_HOSTING": hosting}
 
 
 def create(path: str, **options: Any) -> DatasetWriter:

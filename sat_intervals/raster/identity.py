@@ -17,10 +17,8 @@ from rasterio.io import DatasetReader
 
 from sat_intervals.errors import ChangedInputError, SatIntervalsError
 from sat_intervals.raster import gdal
-from sat_intervals.store.folder import object_tag
+from sat_intervals.store.remote import RemotePath, object_tag, path_of
 
-# GDAL's prefixes of object stores, and those of fsspec.
-_STORES = {"/vsis3/": "s3://", "/vsigs/": "gs://", "/vsiaz/": "az://"}
 _INSIDE = re.compile(r"/vsi\w+/\{?")  # GDAL's prefix to read inside an archive
 _NO_PATH = re.compile(r"/vsi|\w+:")  # names that are no paths: GDAL's file systems and subdatasets, and URLs
 _TIMEOUT = 30  # seconds until a server must answer
@@ -42,9 +40,8 @@ def identity(path: str, known: Mapping[str, Mapping[str, Any]] | None = None) ->
     name = path.removeprefix("/vsicurl/")
     if name.startswith(("http://", "https://")):
         return {"path": path} | _of_url(name)
-    for prefix, scheme in _STORES.items():
-        if path.startswith((prefix, scheme)):
-            return {"path": path} | object_tag(path.replace(prefix, scheme, 1))
+    if isinstance(there := path_of(path), RemotePath):
+        return {"path": path} | object_tag(str(there))
     if not _NO_PATH.match(path):
         raise ChangedInputError(f"{path} cannot be read: it is missing, a folder, or a link to nothing: restore it")
     return {"path": path}
@@ -59,14 +56,19 @@ def identities(record: Any) -> dict[str, dict[str, Any]]:
 
 def relative_in(folder: Path, record: Any) -> Any:
     """Return a record of identities; paths inside a folder become relative, ``./left.tif``: the folder may be moved."""
-    inside = os.path.join(os.path.realpath(folder), "")
+    inside = os.path.join(_resolved(folder), "")
     return _with_paths(record, lambda path: f"./{path.removeprefix(inside)}" if path.startswith(inside) else path)
 
 
 def absolute_in(folder: Path, record: Any) -> Any:
     """Return a record of `relative_in` for the place where its folder is now."""
-    inside = os.path.join(os.path.realpath(folder), "")
+    inside = os.path.join(_resolved(folder), "")
     return _with_paths(record, lambda path: inside + path[2:] if path.startswith("./") else path)
+
+
+def _resolved(name: str | Path) -> str:
+    """Return the path of a file or folder without links, or its URL."""
+    return str(path_of(name).resolve())
 
 
 def _with_paths(record: Any, changed: Callable[[str], str]) -> Any:
@@ -152,15 +154,16 @@ def check_not_replaced(
     inputs: Iterable[str | Path | None], outputs: Iterable[str | Path], folders: Iterable[str | Path] = ()
 ) -> None:
     """Raise if an output, or a file in one of the ``folders``, is also an input, or a link to it; None is ignored."""
-    written = {os.path.realpath(output): output for output in outputs}
-    parents = {os.path.realpath(folder) for folder in folders}
-    for name in inputs:
-        file = name if name is None or os.path.exists(name) else local_file(os.fspath(name))
+    written = {_resolved(output): output for output in outputs}
+    parents = {_resolved(folder) for folder in folders}
+    for name in (one for one in inputs if one is not None):
+        is_path = isinstance(path_of(name), RemotePath) or os.path.exists(name)
+        file = name if is_path else local_file(os.fspath(name))
         if file is None:
             continue
-        if found := written.get(os.path.realpath(file)):
+        if found := written.get(_resolved(file)):
             raise SatIntervalsError(f"{name} is an input, and {found} would be written: choose another output")
-        for folder in map(str, Path(os.path.realpath(file)).parents):
+        for folder in map(str, path_of(_resolved(file)).parents):
             if folder in parents:
                 raise SatIntervalsError(
                     f"{name} is an input inside {folder}, whose files are written and deleted: choose another output"

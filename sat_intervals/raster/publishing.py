@@ -16,6 +16,7 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import as_json
 from sat_intervals.raster import gdal
 from sat_intervals.raster.files import File
+from sat_intervals.store.remote import RemotePath, disk_of, is_folder, is_there, path_of
 
 _REMEDY = "free disk space or choose another folder"
 # Errors of the path: more space does not help.
@@ -30,9 +31,10 @@ class OutputError(SatIntervalsError):
 
 def check_free(path: str | os.PathLike[str], *, overwrite: bool) -> None:
     """Raise OutputError if a file exists that may not be replaced, or a folder has its name."""
-    if os.path.isdir(path):
+    path = path_of(path)
+    if is_folder(path):
         raise OutputError(f"{path} is a folder: choose another name")
-    if os.path.lexists(path) and not overwrite:
+    if is_there(path) and not overwrite:
         raise OutputError(f"{path} exists: choose another name or --overwrite")
 
 
@@ -40,9 +42,10 @@ def check_free(path: str | os.PathLike[str], *, overwrite: bool) -> None:
 def new_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield an empty temporary file beside a path, to be written in place; rename it at the end, or delete it.
 
+    Of a path in a bucket it is on a disk, see `disk_of`, and is uploaded.
     The next call replaces what a killed process left. Raise OutputError if another process is writing the file.
     """
-    with failing(Path(path)), unfinished(Path(path)) as file:
+    with failing(path := path_of(path)), unfinished(path) as file:
         yield file.temporary
         file.flush()
         file.commit()
@@ -74,6 +77,9 @@ class Unfinished:
 
     def commit(self) -> None:
         """Give the file its name."""
+        if isinstance(self.path, RemotePath):
+            self.path.upload(self.temporary)
+            return
         os.replace(self.temporary, self.path)
         self.is_committed = True
         _flush_folder(self.path.parent)
@@ -85,6 +91,8 @@ def unfinished(path: Path) -> Iterator[Unfinished]:
     temporary = _temporary(path)
     with ExitStack() as stack:
         with failing(path):
+            if isinstance(path, RemotePath):
+                temporary.parent.mkdir(parents=True, exist_ok=True)
             stream = stack.enter_context(open(temporary, "ab"))
             _lock(stream.fileno(), temporary, path)
             stream.truncate(0)
@@ -103,17 +111,18 @@ def failing(path: Path) -> Iterator[None]:
         yield
     except (*gdal.GDAL_ERRORS, OSError) as error:
         name = getattr(error, "filename", None)
-        if name is not None and Path(name) not in (path, _temporary(path), *path.parents):
+        if name is not None and path_of(name) not in (path, _temporary(path), *path.parents):
             raise
         reason = getattr(error, "strerror", None) or gdal.reason(error)
-        what = f"{reason}: {'choose another name or folder' if isinstance(error, _OF_PATH) else _REMEDY}"
+        of_path = "choose another name or folder" if isinstance(error, _OF_PATH) else _REMEDY
+        what = f"{reason}: {'check server and credentials' if '://' in str(name) else of_path}"
         if gdal.is_out_of_memory(error):
             what = f"not enough memory ({gdal.reason(error)}): give the process more memory"
         raise OutputError(f"{path} cannot be written: {what}") from error
 
 
 def _temporary(path: Path) -> Path:
-    return path.with_name(f".{path.name}.part")
+    return disk_of(path.parent) / f".{path.name}.part"
 
 
 def _lock(descriptor: int, temporary: Path, path: Path) -> None:
@@ -154,6 +163,7 @@ def part_bytes(files: Sequence[File], height: int, width: int) -> int:
 
 def check_space(folder: Path, needed: int, what: str) -> None:
     """Raise OutputError if a folder has not enough free space for ``what``, which may need so many bytes."""
+    folder = disk_of(folder)
     free = shutil.disk_usage(folder).free
     if needed > free:
         raise OutputError(f"{folder} has {_size(free)} free, {what} may need {_size(needed)}: {_REMEDY}")

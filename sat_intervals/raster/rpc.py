@@ -2,6 +2,7 @@
 
 import os
 import re
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -10,9 +11,11 @@ import numpy as np
 from rasterio import Env
 from rasterio.rpc import RPC
 
+from sat_intervals.errors import InputError
 from sat_intervals.raster import gdal
 from sat_intervals.raster.identity import in_zip
 from sat_intervals.raster.images import opened
+from sat_intervals.store.remote import RemotePath, path_of
 
 _BESIDE = ".rpb", "_rpc.txt"  # what GDAL reads beside an image only, and what shareloc does not read at all
 # Names in the order of files without names, after two errors in some.
@@ -27,26 +30,38 @@ def find_model(image: str) -> str | None:
     with opened(image) as dataset:
         known, files = dataset.rpcs is not None, dataset.files
     if not known:
-        beside = str(Path(image).with_suffix(".geom"))
-        if (in_zip(beside) or Path(beside)).is_file():
-            return beside
+        beside = path_of(image).with_suffix(".geom")
+        if (in_zip(str(beside)) or beside).is_file():
+            return str(beside)
         return find_model(os.path.realpath(image)) if os.path.islink(image) else None
     # RPC_*.XML of DIMAP is of the whole product: only GDAL moves it to the tile of the image
     own = [file for file in files if Path(file).name.lower().endswith(_BESIDE)]
-    return own[0] if own and not in_zip(image) else image
+    return str(path_of(own[0])) if own and not in_zip(image) else image
 
 
-def local_copy(path: str, folder: str) -> str:
-    """Return a path; of a text file in a zip archive that of a copy in a folder: only GDAL reads archives."""
+def local_copy(path: str, folder: str, ends: tuple[str, ...] = (".geom", ".xml")) -> str:
+    """Return a path; of a file in a zip archive or bucket that of a copy in a folder, if its name has one of ``ends``.
+
+    Only GDAL reads archives and buckets.
+    """
+    if isinstance(there := path_of(path), RemotePath) and path.lower().endswith(ends):
+        copy = Path(folder) / there.name
+        copy.write_bytes(there.read_bytes())
+        return str(copy)
     file = in_zip(path)
     return file.root.extract(file.at, folder) if file and path.endswith(".geom") else path
 
 
 def read_rpc_file(path: str) -> dict[str, Any] | None:
-    """Return the coefficients in a text file by rasterio's names, whatever its name; None if it is of another kind."""
-    if not os.path.isfile(path) or os.path.getsize(path) > 100_000:  # no raster is read whole
+    """Return the coefficients in a text file, whatever its name, or of an image in a bucket; None of other kinds."""
+    file = path_of(path)
+    if isinstance(file, RemotePath):
+        with suppress(InputError), opened(path) as dataset:
+            if dataset.rpcs:
+                return dict(dataset.rpcs.to_dict())
+    if not file.is_file() or file.stat().st_size > 100_000:  # no raster is read whole
         return None
-    text = Path(path).read_bytes().decode("latin-1")
+    text = file.read_bytes().decode("latin-1")
     values = re.split(r"[\s,;]+", text.strip(" \t\r\n,;"))
     if re.fullmatch(r"[-+.\deE]+", "".join(values)) and len(values) in (90, 92):
         text = "\n".join(f"{name}: {value}" for name, value in zip(_SINGLE + _LISTS, values[-90:], strict=True))

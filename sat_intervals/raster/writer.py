@@ -17,6 +17,7 @@ from sat_intervals.raster.files import File
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.publishing import Unfinished, check_space, failing, file_bytes, unfinished
 from sat_intervals.raster.streaming import Stream
+from sat_intervals.store.remote import disk_of, path_of
 
 
 class OutputWriter:
@@ -37,7 +38,7 @@ class OutputWriter:
         *,
         threads: int | None = None,
     ) -> None:
-        self._folder = Path(folder)
+        self._folder = path_of(folder)
         self._files = {file.name: file for file in files}
         self._shape = height, width
         self._georeferencing = georeferencing
@@ -72,7 +73,7 @@ class OutputWriter:
                     self._pictures.setdefault(name, []).append(bands)
                     continue
                 if name not in self._streams:
-                    self._streams[name] = Stream(file, self._folder, self._shape, self._threads)
+                    self._streams[name] = Stream(file, disk_of(self._folder), self._shape, self._threads)
                     self._opened.callback(self._streams[name].close)
                 self._streams[name].write(row, bands)
 

@@ -1,11 +1,11 @@
 """Put the files of a run together from finished parts, compare its inputs, and publish."""
 
-import filecmp
 import logging
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager, nullcontext
 from functools import partial
+from hashlib import file_digest
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -74,12 +74,17 @@ def _publish(job: Job, writer: OutputWriter, made: Mapping[str, Path], report: d
     """Give the files their names, ``run.json`` last; files that are there must be the same, or may be replaced."""
     for name, new in made.items():
         there = job.out / name
-        if not job.overwrite and there.exists() and not filecmp.cmp(there, new, shallow=False):
+        if not job.overwrite and there.exists() and not _is_same(there, new):
             raise SatIntervalsError(f"{there} is not of this run: move it away or give --overwrite; the tiles are kept")
     with new_file(job.out / RUN_REPORT) as new:  # gets its name last
         new.write_bytes((as_json(report) + "\n").encode())
         (job.out / RUN_REPORT).unlink(missing_ok=True)  # never beside files of another run
         writer.publish()
+
+
+def _is_same(one: Path, other: Path) -> bool:
+    with one.open("rb") as there, other.open("rb") as new:
+        return file_digest(there, "sha256").digest() == file_digest(new, "sha256").digest()
 
 
 def end_tiles(job: Job, *, keep_tiles: bool) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 from threading import Lock
 
 from sat_intervals.config import Cluster
+from sat_intervals.run.state import with_store
 from sat_intervals.run.workers import Outcome, Task, Threads, Workers, cores_of_process, readers
 
 
@@ -15,7 +16,7 @@ class Connection(ExitStack):
     def __init__(self, settings: Cluster, out: Path) -> None:
         """``out`` is the folder for logs of jobs."""
         super().__init__()
-        self._settings = settings
+        self._settings = with_store(settings, out)
         self._out = out
         self._lock = Lock()
         self._workers: Workers | None = None

@@ -19,12 +19,12 @@ from sat_intervals.match.schedule import blocks_of
 from sat_intervals.prepare.pair import Each, FilePair, here
 from sat_intervals.prepare.prepared import Prepared, prepare
 from sat_intervals.products import plain
-from sat_intervals.raster import Image, check_space, files_of
+from sat_intervals.raster import Image, check_space, files_of, path_of
 from sat_intervals.raster.completion import Completion
 from sat_intervals.raster.identity import absolute_in, check_not_replaced, identities, relative_in
 from sat_intervals.run.checks import check_tiles, checked_pair, checked_region, disk_bytes, fitted_to_jobs
 from sat_intervals.run.inputs import describe_inputs
-from sat_intervals.run.state import check_folder, next_step, outputs_of, read_report
+from sat_intervals.run.state import check_folder, next_step, outputs_of, read_report, with_store
 from sat_intervals.store.arrays import DamagedFileError, numbered
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import MANIFEST, PLACE, StoreError, digest, place_of, read_manifest, write_manifest
@@ -217,7 +217,7 @@ def open_job(
     each: Each = here,
 ) -> Job:
     """Check all that can be checked before tiles are matched, and prepare the pair."""
-    config, out = resolved(load_config(config)), Path(out)
+    config, out = resolved(load_config(config)), path_of(out)
     requested = config.disparity.model_dump(mode="json")
     images = checked_pair(left, right, config)
     region = checked_region(images[0], window)
@@ -246,7 +246,7 @@ def job_of(
     swept: Swept | None = None,
 ) -> Job:
     """Make the job of a prepared pair in a folder; its tiles are named by ``pair`` where several share a store."""
-    config = fitted_to_jobs(prepared.config)
+    config = fitted_to_jobs(prepared.config.model_copy(update={"cluster": with_store(prepared.config.cluster, out)}))
     check_tiles(config, region, prepared.ranges)
     prepared = replace(prepared, config=config)
     read = [*identities(inputs), *(files_of(config.disparity.grid) if config.disparity.grid else ())]

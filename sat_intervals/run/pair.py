@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,7 +12,7 @@ from sat_intervals.match.matching_cost import VolumeOf
 from sat_intervals.match.schedule import Schedule
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress, add_seconds, logged_stage
-from sat_intervals.raster import Image
+from sat_intervals.raster import Image, path_of
 from sat_intervals.results import open_run
 from sat_intervals.run.assemble import assemble, end_tiles
 from sat_intervals.run.beside import compiled_beside
@@ -50,8 +49,9 @@ def match_pair(
     left, right
         Paths, or images opened by `open_image` with a band, a no-data value or a mask.
     out
-        Folder for ``intervals.tif``, ``validity.tif`` and ``run.json``. Finished tiles are kept there, or in
-        ``cluster.store``, until the run is complete; after an interruption the same call resumes from them.
+        Folder for ``intervals.tif``, ``validity.tif`` and ``run.json``, which may be in a bucket: ``s3://bucket/run``.
+        Finished tiles are kept there, or in ``cluster.store``, until the run is complete; after an interruption the
+        same call resumes from them.
     config
         Settings, or a source for `load_config`, by default those of satellite images; ``cluster`` says where tiles are
         matched. A search range that is auto is found from the whole images first, see `search_range`.
@@ -83,7 +83,7 @@ def match_pair(
     RunError
         Tiles failed; no output was published.
     """
-    config, out = _named(load_config(config), volume_of), Path(out)
+    config, out = _named(load_config(config), volume_of), path_of(out)
     seconds: dict[str, float] = {}
     with compiled_beside(config), Connection(config.cluster, out) as connection:
         with logged_stage(seconds, "start"):
@@ -148,6 +148,8 @@ def match_and_assemble(job: Job, workers: Workers, seconds: dict[str, float], pr
             if attempt == _TRIES:
                 raise
             _LOG.warning("%s; trying this now", error)
+        except OSError as error:
+            raise RunError(f"{reason(error)}: rerun the same command: it resumes") from error
     raise AssertionError  # not reached
 
 
@@ -194,8 +196,7 @@ def match_jobs(workers: Workers, jobs: Sequence[Job], progress: Progress) -> Ite
                 error = RunError(f"tracing its path states, wavefront {step.wavefront}: {reason(error)}")
             for tile in jobs[i].store.grid.within(step.block.core):
                 matched[i].failures.setdefault(tile.name, error)
-                with suppress(OSError):  # a full disk must not end the run
-                    jobs[i].store.write(FAILURES, tile.name, reason=reason(error))
+                _note_failure(jobs[i], tile, error)
         _LOG.debug("%s: tile %s %s", jobs[i].out, step.name, f"failed: {reason(error)}" if error else "done")
         done = total - sum(map(len, schedules))
         progress("tiles", done, total)
@@ -204,6 +205,15 @@ def match_jobs(workers: Workers, jobs: Sequence[Job], progress: Progress) -> Ite
                 jobs[i].store.remove([PIXELS, COSTS])
             yield matched[i]
     assert not any(schedules)  # else steps would wait for each other
+
+
+def _note_failure(job: Job, tile: Tile, error: BaseException) -> None:
+    """Note why a tile failed, where a full disk must not end the run, but a server that is away must."""
+    try:
+        job.store.write(FAILURES, tile.name, reason=reason(error))
+    except OSError:
+        if not job.store.folder.is_local:
+            raise
 
 
 def _schedule(job: Job, tiles: Sequence[Tile]) -> Schedule:

@@ -1,16 +1,16 @@
 """The state of a run's folder: what its manifest and its ``run.json`` say, and what a command does then."""
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from sat_intervals.config import Config
+from sat_intervals.config import Cluster, Config
 from sat_intervals.errors import ChangedInputError, SatIntervalsError
 from sat_intervals.products import plain
-from sat_intervals.raster import RUN_FILES, File, run_files
+from sat_intervals.raster import RUN_FILES, File, RemotePath, run_files
 from sat_intervals.store.manifest import MANIFEST, StoreError, differences, read_manifest
+from sat_intervals.store.remote import is_folder, is_there
 from sat_intervals.store.tiles import home_of
 
 RUN_REPORT = "run.json"
@@ -30,6 +30,12 @@ def files_of_run(config: Config) -> tuple[File, File]:
 def outputs_of(config: Config) -> tuple[str, ...]:
     """Return the names of all files that a run writes."""
     return *(file.name for file in files_of_run(config)), RUN_REPORT
+
+
+def with_store(settings: Cluster, out: Path) -> Cluster:
+    """Return settings that keep tiles in the folder of a run, if that is in a bucket and no store is given."""
+    is_kept = settings.store is None and isinstance(out, RemotePath)
+    return settings.model_copy(update={"store": str(home_of(out))}) if is_kept else settings
 
 
 def read_report(out: Path) -> dict[str, Any] | None:
@@ -54,14 +60,14 @@ def is_complete(out: Path) -> bool:
 
 def check_folder(out: Path, *, overwrite: bool, names: Sequence[str] = OUTPUTS) -> None:
     """Raise if a folder cannot be that of a run, or has files of its names that no run has made."""
-    if os.path.lexists(out) and not os.path.isdir(out):
+    if is_there(out) and not is_folder(out):
         raise SatIntervalsError(f"{out} is not a folder: choose another")
-    if folders := [name for name in names if os.path.isdir(out / name)]:
+    if folders := [name for name in names if is_folder(out / name)]:
         raise SatIntervalsError(f"{out / folders[0]} is a folder: move it away or choose another folder")
     if overwrite or read_report(out) is not None:
         return
-    is_begun = os.path.exists(home_of(out) / MANIFEST)  # a death may have left rasters, but no report
-    if there := [name for name in names if os.path.lexists(out / name) and (not is_begun or name == RUN_REPORT)]:
+    is_begun = is_there(home_of(out) / MANIFEST)  # a death may have left rasters, but no report
+    if there := [name for name in names if is_there(out / name) and (not is_begun or name == RUN_REPORT)]:
         raise SatIntervalsError(
             f"{out / there[0]} exists and is of no complete run: move it away, choose another folder or "
             "--overwrite (overwrite=True)"

@@ -14,9 +14,9 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import BANDS, CHANGE, ORTHO, SURFACE, SURFACE_OF_SWEEP
-from sat_intervals.raster import Georeferencing, open_image, read_layers, read_place, read_small_layers, read_tags
+from sat_intervals.raster import Georeferencing, RemotePath, open_image, path_of, read_layers, read_place, read_tags
 from sat_intervals.raster.publishing import write_file
-from sat_intervals.raster.windows import read_small_image
+from sat_intervals.raster.windows import read_small_image, read_small_layers
 from sat_intervals.results import Run, open_input, open_run, read_change
 from sat_intervals.show import styles
 from sat_intervals.show.legend import widest
@@ -65,7 +65,7 @@ def write_project(out: str | Path) -> list[Path]:
     the files are local.
     """
     if read_change(out):
-        return _write(Path(out), [*_change(Path(out))])
+        return _write(path_of(out), [*_change(path_of(out))])
     run = open_run(out)
     names = (f"{name}{end}" for name in _STYLED for end in (".qml", ".vrt"))
     run.check_kept([run.out / name for name in (_PROJECT, *names)])
@@ -77,10 +77,10 @@ def write_project(out: str | Path) -> list[Path]:
 
 def _write(out: Path, layers: list[ProjectLayer]) -> list[Path]:
     """Write a project of layers, virtual rasters and styles; return the files."""
-    written = {Path(layer.raster.source): layer.raster.virtual for layer in layers if layer.raster.virtual}
+    written = {path_of(layer.raster.source): layer.raster.virtual for layer in layers if layer.raster.virtual}
     for layer in layers:
         if layer.is_default:
-            written[Path(layer.raster.source).with_suffix(".qml")] = styles.default_style(layer.renderer)
+            written[path_of(layer.raster.source).with_suffix(".qml")] = styles.default_style(layer.renderer)
     content = BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
         root = _project(out, layers)
@@ -255,8 +255,12 @@ def _extent(raster: Raster) -> dict[str, str]:
 
 def _relative(source: str | Path, folder: Path) -> str:
     """Return a local file relative to the folder of the project, as QGIS writes it, and any other name as GDAL's."""
-    name = str(source)
-    if isinstance(source, str) and not Path(name).exists():
-        return name.replace("s3://", "/vsis3/", 1) if name.startswith("s3://") else name
-    relative = Path(os.path.relpath(Path(name).resolve(), folder.resolve())).as_posix()
+    name, path = str(source), path_of(source)
+    if isinstance(path, RemotePath):
+        return path.gdal_name
+    if isinstance(source, str) and not path.exists():
+        return name
+    if isinstance(folder, RemotePath):
+        return str(path.resolve())
+    relative = Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
     return relative if relative.startswith("../") else f"./{relative}"

@@ -1,22 +1,14 @@
-"""A folder of intermediate files, on a disk or as a prefix of an fsspec file system such as an S3 bucket.
+"""A folder of intermediate files, on a disk or as a prefix of an fsspec file system such as an S3 bucket."""
 
-Addresses and credentials of a server come from its environment variables and files (``AWS_ENDPOINT_URL``, ``~/.aws``)
-or from fsspec's.
-"""
-
-import errno
 import os
 import uuid
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
-import fsspec
-
-# Read at once from a server: the members of a file that a strip reads follow each other.
-_BLOCK = 4 << 20
+from sat_intervals.store.remote import opened_at, reached
 
 
 @dataclass(frozen=True)
@@ -37,34 +29,20 @@ class Folder:
         """Return whether it is on a disk."""
         return "://" not in self.place
 
-    @contextmanager
-    def _reached(self) -> Iterator[Any]:
-        """Yield the file system, which fsspec keeps; errors of its libraries become OSError."""
-        try:
-            yield fsspec.url_to_fs(self.place, use_listings_cache=False)[0]
-        except OSError:
-            raise
-        except Exception as error:
-            raise OSError(errno.EIO, " ".join(str(error).split()) or type(error).__name__, self.place) from error
-
     def _path(self, name: str) -> str:
         return f"{self.place}/{name}"
 
     @contextmanager
     def opened(self, name: str) -> Iterator[IO[bytes]]:
         """Open a file for reading any part of it."""
-        if self.is_local:
-            stream = open(self._path(name), "rb")  # noqa: SIM115
-        else:
-            with self._reached() as system:
-                stream = system.open(self._path(name), "rb", block_size=_BLOCK, cache_type="readahead")
-        with stream:
+        path = self._path(name)
+        with open(path, "rb") if self.is_local else opened_at(path) as stream:
             yield stream
 
     def write(self, name: str, content: bytes | memoryview, *, is_flushed: bool = False) -> None:
         """Write a file that exists only when it is complete; ``is_flushed``: also after a power loss."""
         if not self.is_local:
-            with self._reached() as system:
+            with reached(self.place) as system:
                 system.pipe_file(self._path(name), bytes(content))
             return
         path = Path(self._path(name))
@@ -83,7 +61,7 @@ class Folder:
 
     def sizes(self, kind: str) -> dict[str, int]:
         """Return the sizes in bytes of the finished files in a subfolder, by name."""
-        with suppress(FileNotFoundError), self._reached() as system:
+        with suppress(FileNotFoundError), reached(self.place) as system:
             found = system.ls(self._path(kind), detail=True)
             files = {os.path.basename(file["name"]): file["size"] for file in found if file["type"] == "file"}
             return {name: size for name, size in files.items() if not name.startswith(".")}
@@ -91,14 +69,14 @@ class Folder:
 
     def delete(self, names: Iterable[str]) -> None:
         """Delete files, if they exist."""
-        with self._reached() as system:
+        with reached(self.place) as system:
             for name in names:
                 with suppress(FileNotFoundError):
                     system.rm_file(self._path(name))
 
     def remove(self, kind: str) -> None:
         """Delete a subfolder with all that is in it."""
-        with suppress(FileNotFoundError), self._reached() as system:
+        with suppress(FileNotFoundError), reached(self.place) as system:
             system.rm(self._path(kind), recursive=True)
 
     def remove_if_empty(self) -> None:
@@ -113,15 +91,3 @@ def folder_at(place: str | Path) -> Folder:
     protocol, _, path = str(place).rpartition("://")
     is_local = protocol in ("", "file", "local")
     return Folder(str(Path(path).absolute()) if is_local else str(place).rstrip("/"))
-
-
-def object_tag(url: str) -> dict[str, Any]:
-    """Return size in bytes and ETag of an object; empty if fsspec cannot reach it."""
-    try:
-        system, path = fsspec.url_to_fs(url)
-        system.invalidate_cache(path)
-        content = system.info(path)
-    except Exception:  # of many libraries
-        return {}
-    tag = content.get("ETag") or content.get("etag") or content.get("LastModified")
-    return {"bytes": content.get("size"), "etag": None if tag is None else str(tag)}

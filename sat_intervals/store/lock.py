@@ -7,14 +7,19 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.store.remote import disk_of
 
 _LOCK = ".sat-intervals.lock"
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Create and lock a folder for the block; the lock ends with its process, its file stays."""
+    """Create and lock a folder for the block; the lock ends with its process, its file stays.
+
+    A folder in a bucket is locked for the commands of this machine and user.
+    """
     try:
+        home, folder = folder, disk_of(folder)
         folder.mkdir(parents=True, exist_ok=True)
         stream = open(folder / _LOCK, "ab")  # noqa: SIM115
     except OSError as error:
@@ -25,14 +30,14 @@ def locked(folder: Path) -> Iterator[None]:
         except OSError as error:
             is_busy = isinstance(error, BlockingIOError)
             why = "another run is active in it: wait for its end" if is_busy else f"no lock there: {error.strerror}"
-            raise SatIntervalsError(f"{folder} cannot be used, {why} or choose another folder") from error
+            raise SatIntervalsError(f"{home} cannot be used, {why} or choose another folder") from error
         yield
 
 
 def is_locked(folder: Path) -> bool:
     """Return whether a run is active in a folder."""
     with suppress(FileNotFoundError):
-        lock = os.open(folder / _LOCK, os.O_RDONLY)
+        lock = os.open(disk_of(folder) / _LOCK, os.O_RDONLY)
         try:
             fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:

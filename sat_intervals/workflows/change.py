@@ -12,7 +12,7 @@ from sat_intervals.heights.polygons import write_polygons
 from sat_intervals.kernels.significance import SCALE
 from sat_intervals.products import plain
 from sat_intervals.progress import Progress
-from sat_intervals.raster import OutputWriter, check_free, check_not_replaced
+from sat_intervals.raster import OutputWriter, check_free, check_not_replaced, path_of
 from sat_intervals.raster.files import change_file
 from sat_intervals.raster.publishing import write_record
 
@@ -74,7 +74,7 @@ def change(
     SatIntervalsError
         A surface cannot be used, nothing is common, or a file exists.
     """
-    out, stable = Path(out), None if stable is None else Path(stable)
+    out, stable = path_of(out), None if stable is None else path_of(stable)
     _check(false_alarms, smallest_area, sigma)
     for name in FILES:
         check_free(out / name, overwrite=overwrite)

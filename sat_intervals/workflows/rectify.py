@@ -6,7 +6,7 @@ from typing import Any
 
 from sat_intervals.heights.rectify import RawPair, make_pair
 from sat_intervals.progress import Progress
-from sat_intervals.raster import Image, open_image
+from sat_intervals.raster import Image, open_image, path_of
 from sat_intervals.run.preparing import compared_rows
 from sat_intervals.run.quality import doubts_of_images
 
@@ -67,9 +67,9 @@ def rectify(
 
     left, right = (one if isinstance(one, Image) else open_image(one) for one in (left, right))
     dem, geoid, left_model, right_model = (
-        None if file is None else Path(file) for file in (dem, geoid, left_model, right_model)
+        None if file is None else path_of(file) for file in (dem, geoid, left_model, right_model)
     )
     pair = RawPair(left, right, (left_model, right_model), Terrain(dem, altitude, geoid), resolution_of or "coarser")
     compare = partial(compared_rows, progress=progress) if compares_rows else None
-    record = make_pair(pair, Path(out), overwrite=overwrite, compare=compare, progress=progress)
+    record = make_pair(pair, path_of(out), overwrite=overwrite, compare=compare, progress=progress)
     return record | {"warnings": doubts_of_images(left, right)}

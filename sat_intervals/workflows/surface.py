@@ -14,7 +14,7 @@ from sat_intervals.heights.rectify import IMAGES, raw_inputs, rectified_files
 from sat_intervals.match.costs import check_cost
 from sat_intervals.products import ORTHO
 from sat_intervals.progress import Progress
-from sat_intervals.raster import Image, check_not_replaced, files_of, open_image
+from sat_intervals.raster import Image, check_not_replaced, files_of, open_image, path_of
 from sat_intervals.run.pair import match_pair
 from sat_intervals.run.state import OUTPUTS
 from sat_intervals.tiling import Window
@@ -115,8 +115,8 @@ def surface(
         Tiles failed; no output was published.
     """
     opened = [one if isinstance(one, Image) else open_image(one) for one in images]
-    config, out, geoid = load_config(config, images=len(opened)), Path(out), Path(geoid) if geoid else None
-    resolution = Path(resolution) if isinstance(resolution, str) else resolution
+    config, out, geoid = load_config(config, images=len(opened)), path_of(out), path_of(geoid) if geoid else None
+    resolution = path_of(resolution) if isinstance(resolution, str) else resolution
     choices, raw = choices or SurfaceChoices(), {"dem": dem, "altitude": altitude, "resolution_of": resolution_of}
     of_many = choices.calibration, choices.fill, choices.flatten, choices.mask
     of_points = replace(choices, calibration=None, fill=None, flatten=None, mask=None) != SurfaceChoices()
@@ -180,7 +180,9 @@ def epipolar_pair(
     """
     left, right = images
     files = (
-        tuple(Path(file) for file in sensors if file) if has_grids(sensors) else rectified_files(left.path, right.path)
+        tuple(path_of(file) for file in sensors if file)
+        if has_grids(sensors)
+        else rectified_files(left.path, right.path)
     )
     if files:
         given = [name for name in ("dem", "altitude", "resolution_of") if raw.get(name) is not None]
