@@ -1,6 +1,6 @@
 """``sat-intervals plot``: draw pictures of a finished run."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -56,6 +56,7 @@ def plot(
     """  # noqa: D301 (\b keeps the line breaks in click)
     from sat_intervals.results import open_results, read_change
     from sat_intervals.show.accuracy import draw_coverage
+    from sat_intervals.show.change_map import draw_change
     from sat_intervals.show.maps import draw_errors, draw_overview
     from sat_intervals.show.preparation import draw_range, draw_rows, has_range, has_rows
     from sat_intervals.show.profile import draw_curve, draw_profile
@@ -63,29 +64,35 @@ def plot(
 
     of_pair = {"row": row, "columns": columns, "pixel": pixel, "beside": beside or None}
     if changed := read_change(out):
-        return _plot_change(out, changed, dpi, of_pair | {"truth": truth})
+        _refuse(of_pair | {"truth": truth}, f"{out} is a change between two dates")
+        return _draw(out, {"change": partial(draw_change, out / "change.tif", changed, dpi=dpi)})
     results = open_results(out, truth)
+    of_surface = {"dsm": partial(draw_surface, out / "dsm.tif", dpi=dpi)}
     if results.is_sweep:
-        return _plot_sweep(results, dpi, of_pair)
+        _refuse(of_pair, f"{out} is of {len(results.images)} images")
+        results.check_kept([out / "dsm.png"])
+        return _draw(out, of_surface)
     is_judged = results.truth is not None and results.config.interval is not None
     _check_options(results, row, columns, beside, is_judged=is_judged)
     results.check_kept([out / f"{name}.png" for name in PICTURES], [truth, judging["mask"], out / "dsm.tif"])
-    drawings: dict[str, Callable[[Path], None]] = {"overview": lambda target: draw_overview(results, target, dpi)}
+    drawings: dict[str, Callable[[Path], None]] = {"overview": partial(draw_overview, results, dpi=dpi)}
     if is_judged:
-        drawings["errors"] = lambda target: draw_errors(results, target, dpi)
+        drawings["errors"] = partial(draw_errors, results, dpi=dpi)
     if beside:
-        drawings["coverage"] = lambda target: draw_coverage([out, *beside], target, dpi, truth=truth, **judging)
-    for name, has, drawn in (("range", has_range, draw_range), ("rows", has_rows, draw_rows)):
-        if has(results):
-            drawings[name] = partial(drawn, results, dpi=dpi)
+        drawings["coverage"] = partial(draw_coverage, [out, *beside], dpi=dpi, truth=truth, **judging)
+    prepared = ("range", has_range, draw_range), ("rows", has_rows, draw_rows)
+    drawings |= {name: partial(drawn, results, dpi=dpi) for name, has, drawn in prepared if has(results)}
     if row is not None:
         results.check_part(row, columns)
         drawings["profile"] = lambda target: draw_profile(results, target, row, columns, dpi)
     if pixel:
         results.check_pixel(*pixel)
         drawings["curve"] = lambda target: draw_curve(results, target, *pixel, dpi)
-    if results.has_current("dsm.tif"):
-        drawings["dsm"] = lambda target: draw_surface(out / "dsm.tif", target, dpi)
+    _draw(out, drawings | (of_surface if results.has_current("dsm.tif") else {}))
+
+
+def _draw(out: Path, drawings: Mapping[str, Callable[[Path], None]]) -> None:
+    """Draw pictures and print their names."""
     for name, draw in drawings.items():
         draw(out / f"{name}.png")
         click.echo(out / f"{name}.png")
@@ -111,22 +118,3 @@ def _refuse(of_pair: dict[str, Any], what: str) -> None:
 
     if given := [name for name, value in of_pair.items() if value is not None]:
         raise SatIntervalsError(f"--{given[0]} is for a pair, {what}: leave it out")
-
-
-def _plot_change(out: Path, report: dict[str, Any], dpi: int, of_pair: dict[str, Any]) -> None:
-    """Draw the change between two dates."""
-    from sat_intervals.show.change_map import draw_change
-
-    _refuse(of_pair, f"{out} is a change between two dates")
-    draw_change(out / "change.tif", report, out / "change.png", dpi)
-    click.echo(out / "change.png")
-
-
-def _plot_sweep(results: "Results", dpi: int, of_pair: dict[str, Any]) -> None:
-    """Draw the heights of many images."""
-    from sat_intervals.show.surface_map import draw_surface
-
-    _refuse(of_pair, f"{results.out} is of {len(results.images)} images")
-    results.check_kept([results.out / "dsm.png"])
-    draw_surface(results.out / "dsm.tif", results.out / "dsm.png", dpi)
-    click.echo(results.out / "dsm.png")

@@ -191,10 +191,8 @@ def change_lines(report: dict[str, Any]) -> list[str]:
     cells, rate = report["cells"], report["rate"]
     share = {name: f"{100 * count / max(1, cells['compared']):.2f} %" for name, count in cells.items()}
     volumes = (f"{name} {value:.0f} +-{deviation:.0f}" for name, (value, deviation) in report["volume"].items())
-    checked = (
-        f"without --stable, checked on the bulk alone: half of the differences are below {rate['median']:.2f} standard "
-        "deviations"
-    )
+    bulk = f"half of the differences are below {rate['median']:.2f} standard deviations"
+    checked = f"without --stable, checked on the bulk alone: {bulk}"
     if rate["stable"]:
         checked = f"{100 * rate['measured']:.2g} % measured on {rate['stable']} stable cells"
     return [

@@ -238,12 +238,8 @@ def open_run(out: str | Path) -> Run:
 def read_change(out: str | Path) -> dict[str, Any] | None:
     """Return the content of ``change.json`` of a folder; None without the file, or if the folder has a run."""
     file = path_of(out) / "change.json"
-    try:
-        return None if file.with_name("run.json").exists() else dict(json.loads(file.read_bytes()))
-    except FileNotFoundError:
-        return None
-    except ValueError as error:
-        raise SatIntervalsError(f"{file} is damaged: run sat-intervals change with --overwrite") from error
+    is_change = file.exists() and not file.with_name("run.json").exists()
+    return dict(json.loads(file.read_bytes())) if is_change else None
 
 
 def open_results(out: str | Path, truth: str | Path | None = None) -> Results:

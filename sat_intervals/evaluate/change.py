@@ -17,7 +17,6 @@ from sat_intervals.tiling import Grid, Window, strips
 _STRIP = 1 << 20  # cells compared at a time, some hundred bytes each
 _BLOCK, _BLOCKS = 256, 64  # cells along a block that statistics are of, and their number
 _CHANGED = 0.01  # probability up to which they leave differences out
-_STILL = {"shift": (0.0, 0.0, 0.0), "deviation": (0.0, 0.0, 0.0)}
 
 
 class Difference(NamedTuple):
@@ -39,14 +38,15 @@ class Difference(NamedTuple):
 
 @dataclass(frozen=True)
 class Pair:
-    """Surfaces of two dates on the grid of the first; ``registration`` moves the second, see `Registration.report`.
+    """Surfaces of two dates on the grid of the first.
 
-    ``median`` of absolute ratios; ``correlation`` of those without a change, see `kernels.significance`.
+    shift: ``(2, 3)`` metres to the east, north and up that the second one is moved by, and their standard deviation.
+    median: that of absolute ratios; ``correlation`` of those without a change, see `kernels.significance`.
     """
 
     before: Epoch
     after: Epoch
-    registration: dict[str, Any] | None
+    shift: np.ndarray
     median: float = 0.0
     correlation: Correlation = Correlation(1.0, [0.0], [1.0])  # noqa: RUF009 (nothing changes it)
 
@@ -55,19 +55,13 @@ class Pair:
         """Return the scale of Student's distribution."""
         return float(max(SCALE, self.median / MEDIAN))
 
-    @property
-    def shift(self) -> np.ndarray:
-        """Return metres that the second surface is moved by, and their standard deviation: ``(2, 3)``."""
-        known = self.registration or _STILL
-        return np.array([known["shift"], [deviation or 0.0 for deviation in known["deviation"]]])
-
     def strips(self) -> Iterator[Window]:
         """Yield windows of whole rows from the top."""
         return strips(*self.before.shape, _STRIP)
 
     def read(self, window: Window) -> Difference:
         """Read a window of both."""
-        (east, north, up), deviation = self.shift
+        (east, north, up), deviation = self.shift.tolist()
         around = window.grown(1, 1).clipped(Window(0, 0, *self.before.shape))
         inner = window.relative_to(around).slices
         ground = self.before.read(around)
@@ -76,8 +70,8 @@ class Pair:
             self.before.place.shifted(window).moved(-east, -north), height.shape
         )
         one, other = self.before.deviations, self.after.deviations
-        across, down = self.before.place.pixel_size
-        slopes = np.stack([_slope(ground[0], 1)[inner] / across, -_slope(ground[0], 0)[inner] / down])
+        cell = self.before.place.affine
+        slopes = np.stack([_slope(ground[0], 1)[inner] / cell.a, _slope(ground[0], 0)[inner] / cell.e])
         shift = deviation[2] ** 2 + (deviation[0] * slopes[0]) ** 2 + (deviation[1] * slopes[1]) ** 2
         return Difference(
             then - height,
@@ -95,15 +89,18 @@ class Pair:
 
 def _slope(height: np.ndarray, axis: int) -> np.ndarray:
     """Return the slope along an axis for a cell: the mean of those to both neighbours, or that to a known one, or 0."""
-    steps = np.diff(height, axis=axis)
-    ends = [np.pad(steps, [side if one == axis else (0, 0) for one in (0, 1)], constant_values=np.nan)
-            for side in ((1, 0), (0, 1))]  # fmt: skip
+    ends = [np.diff(height, axis=axis, prepend=np.nan), np.diff(height, axis=axis, append=np.nan)]
     known = np.isfinite(ends).sum(axis=0)
     return np.asarray(np.nansum(ends, axis=0) / np.maximum(known, 1))
 
 
-def open_pair(before: str | Path, after: str | Path, sigma: float | None, *, registers: bool) -> tuple[Pair, list[str]]:
-    """Open surfaces of two dates, register the second, measure what differs without a change; return warnings, too."""
+def open_pair(
+    before: str | Path, after: str | Path, sigma: float | None, *, registers: bool
+) -> tuple[Pair, dict[str, Any] | None, list[str]]:
+    """Open surfaces of two dates and measure what differs without a change.
+
+    Returns the registration, too, which moves the second, see `Registration.report`, and warnings.
+    """
     one, other = open_epoch(before, sigma), open_epoch(after, sigma)
     if sigma is not None and one.sigma is None and other.sigma is None:
         raise SatIntervalsError("both surfaces have bounds: leave sigma out")
@@ -116,21 +113,22 @@ def open_pair(before: str | Path, after: str | Path, sigma: float | None, *, reg
     resolution, area = resolution_of(other.path, one.place), covered_window(other.path, one.place, one.shape)
     given = Comparison(one.path, other.path, one.shape, one.place, resolution, 1, area)
     moved, warnings = registered(given) if registers else (given, [])
-    if (found := moved.registration) and None in found["deviation"]:
+    deviation = moved.registration["deviation"] if moved.registration else [0.0] * 3
+    if None in deviation:
         warnings.append(
             "a part of the shift cannot be determined and counts as 0 without an error: flat ground, few common cells, "
             "or surfaces many cells apart"
         )
-    pair = Pair(one, other, moved.registration)
+    pair = Pair(one, other, np.array([moved.shift, [sigma or 0.0 for sigma in deviation]]))
     blocks = list(Grid(area, _BLOCK))
     parts = [pair.read(block.core) for block in blocks[:: -(-len(blocks) // _BLOCKS)]]
     heights, ratios = (
-        np.concatenate([part[np.isfinite(part)] for part in one_of])
-        for one_of in ([part.height for part in parts], [part.ratio for part in parts])
+        np.concatenate([part[np.isfinite(part)] for part in of_parts])
+        for of_parts in ([part.height for part in parts], [part.ratio for part in parts])
     )
-    up = pair.shift[0, 2]
-    warnings += check_common(given, ratios.size, float(np.median(heights)) - up if ratios.size else None)
+    warnings += check_common(given, ratios.size, float(np.median(heights)) - moved.shift[2] if ratios.size else None)
     pair = replace(pair, median=float(np.median(np.abs(ratios))))
     limit = ratio_of(_CHANGED, pair.scale)
     still = [np.where(np.abs(part.ratio) < limit, part.ratio, np.nan) for part in parts]
-    return replace(pair, correlation=correlation_of(still, one.place.pixel_size[0])), warnings
+    pair = replace(pair, correlation=correlation_of(still, one.place.pixel_size[0]))
+    return pair, moved.registration, warnings

@@ -14,7 +14,7 @@ from sat_intervals.products import FLAGS, INVALID, WIDTH, flag_attributes
 from sat_intervals.raster import File, Georeferencing, path_of, read_layers, read_tags, run_files, surface_file
 from sat_intervals.raster.files import change_file
 from sat_intervals.raster.projection import grid_mapping
-from sat_intervals.raster.surfaces import is_change, read_place, surface_place
+from sat_intervals.raster.surfaces import read_place, surface_place
 from sat_intervals.results import open_run
 from sat_intervals.tiling import Window
 
@@ -111,7 +111,7 @@ def open_surface(path: str | Path, chunks: int | None = 2048) -> xr.Dataset:
         The file cannot be read, or is no such file of this package.
     """
     file = path_of(path)
-    changes = is_change(file)
+    changes = "FALSE_ALARMS" in read_tags(file)
     if not changes:
         surface_place(file)
     shape, place = read_place(file, is_flat=False)

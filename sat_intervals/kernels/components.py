@@ -1,4 +1,4 @@
-"""Connected components of a disparity map, whose sizes distinguish surfaces from stray matches.
+"""Connected components: surfaces and stray matches of a disparity map, areas of change of a surface.
 
 Letters: i, j row and column of the pixel that a component grows from; y, x those of its neighbour.
 """
@@ -9,32 +9,35 @@ from sat_intervals.kernels.compiled import cached
 
 
 @cached
-def component_sizes(disparity, known):
-    """Size of the component of each pixel: neighbours along rows and columns that differ by at most one pixel.
+def components(values, known):
+    """Number the components: neighbours along rows and columns whose values differ by at most one.
 
-    disparity, known: ``(rows, columns)`` float32, and bool: pixels with a disparity.
-    Returns ``(rows, columns)`` int32, 0 where nothing is known.
+    values, known: ``(rows, columns)`` signed numbers, and bool: pixels with a value.
+    Returns ``(rows, columns)`` int32, from 1 in the order of their first pixels, 0 where nothing is known.
     """
-    rows, columns = disparity.shape
-    sizes = np.zeros((rows, columns), np.int32)
-    members = np.empty(rows * columns, np.int64)  # of the current component; those before `grown` have been looked at
+    rows, columns = known.shape
+    labels, count = np.zeros((rows, columns), np.int32), 0
+    waiting = np.empty(rows * columns, np.int64)  # pixels of the current component whose neighbours were not looked at
     for r in range(rows):
         for c in range(columns):
-            if not known[r, c] or sizes[r, c]:
+            if not known[r, c] or labels[r, c]:
                 continue
-            sizes[r, c] = 1
-            members[0], count, grown = r * columns + c, 1, 0
-            while grown < count:
-                i, j = members[grown] // columns, members[grown] % columns
-                grown += 1
+            count += 1
+            labels[r, c], waiting[0], left = count, r * columns + c, 1
+            while left:
+                left -= 1
+                i, j = waiting[left] // columns, waiting[left] % columns
                 for n in range(4):
                     y, x = i + (n == 0) - (n == 1), j + (n == 2) - (n == 3)
-                    if not (0 <= y < rows and 0 <= x < columns) or not known[y, x] or sizes[y, x]:
+                    if not (0 <= y < rows and 0 <= x < columns) or not known[y, x] or labels[y, x]:
                         continue
-                    if abs(disparity[y, x] - disparity[i, j]) <= 1:
-                        sizes[y, x] = 1
-                        members[count] = y * columns + x
-                        count += 1
-            for n in range(count):
-                sizes[members[n] // columns, members[n] % columns] = count
-    return sizes
+                    if abs(values[y, x] - values[i, j]) <= 1:
+                        labels[y, x], waiting[left] = count, y * columns + x
+                        left += 1
+    return labels
+
+
+def component_sizes(disparity: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Return the size of the component of each pixel of a disparity map, 0 where nothing is known."""
+    labels = components(disparity, known)
+    return np.asarray(known * np.bincount(labels.ravel())[labels])

@@ -21,7 +21,7 @@ from sat_intervals.products import as_json
 from sat_intervals.raster.files import File
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.layers import read_layers, read_shape
-from sat_intervals.raster.polygons import Areas
+from sat_intervals.raster.polygons import Areas, numbers_of
 from sat_intervals.raster.writer import OutputWriter
 from sat_intervals.tiling import Window
 
@@ -128,18 +128,13 @@ class _Surface:
         """Return a window grown by a reach, its bands with masked cells NaN, and which cells are masked."""
         around = window.grown(reach, reach).clipped(Window(0, 0, *self.shape))
         bands = read_layers(self._path, around)
-        masked = self._numbers(self._how.mask, around) > 0
+        masked = numbers_of(self._how.mask, self._place, around) > 0
         bands[:, masked] = np.nan
         return around, bands, masked
 
-    def _numbers(self, areas: Areas | None, window: Window) -> np.ndarray:
-        """Return the numbers of areas, from 1, of cells."""
-        shape = window.height, window.width
-        return areas.numbers(self._place.shifted(window), shape) if areas else np.zeros(shape, np.int32)
-
     def _tile(self, window: Window) -> tuple[np.ndarray, Counter[str]]:
         around, bands, masked = self._read(window, 2 * self._reach)
-        numbers = self._numbers(self._how.flatten, around)
+        numbers = numbers_of(self._how.flatten, self._place, around)
         flat = (numbers > 0) & ~masked
         bands[:, flat] = np.nan
         bands[:3, flat] = self.levels[:, numbers[flat] - 1]
@@ -174,7 +169,7 @@ class _Surface:
 
     def _rims(self, areas: Areas, window: Window) -> tuple[np.ndarray, np.ndarray]:
         """Return numbers of the areas whose rims have the cells of a window, ``(n,)``; their heights and bounds."""
-        near = numbers = self._numbers(areas, window.grown(_RIM, _RIM).clipped(Window(0, 0, *self.shape)))
+        near = numbers = numbers_of(areas, self._place, window.grown(_RIM, _RIM).clipped(Window(0, 0, *self.shape)))
         if not numbers.any():
             return np.empty(0, np.int32), np.empty((3, 0), np.float32)
         around, bands, _ = self._read(window, _RIM)

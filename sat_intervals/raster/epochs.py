@@ -6,7 +6,6 @@ from statistics import NormalDist
 
 import numpy as np
 from pyproj import Transformer
-from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.change import drawn
@@ -16,18 +15,17 @@ from sat_intervals.raster.heightfield import is_ground, warn_of_no_data
 from sat_intervals.raster.images import opened
 from sat_intervals.raster.layers import read_layers
 from sat_intervals.raster.projection import transformed
-from sat_intervals.raster.surfaces import is_change, read_heights, read_place, resolution_of
+from sat_intervals.raster.surfaces import read_heights, read_place, resolution_of
 from sat_intervals.store.remote import path_of
 from sat_intervals.tiling import Window
 
 _COVERAGE = 0.9  # of bounds that are made of standard deviations
-_LEAST = 2  # rows and columns: slopes need them
 _DEVIATIONS = "sigma", "std", "error", "uncertainty"  # words in names of bands
 
 
 @dataclass(frozen=True)
 class Epoch:
-    """Heights of a date; ``sigma`` is their standard deviation, None with bounds; ``band`` that of sigma, from 1."""
+    """Heights of a date; ``sigma`` is their standard deviation, None with bounds; ``band`` that of sigma, 0 without."""
 
     path: Path
     shape: tuple[int, int]
@@ -35,7 +33,7 @@ class Epoch:
     level: str  # what heights are above, "" if unknown
     coverage: float
     sigma: float | None = None
-    band: int | None = None
+    band: int = 0
 
     @property
     def deviations(self) -> float:
@@ -44,12 +42,13 @@ class Epoch:
 
     def read(self, window: Window) -> np.ndarray:
         """Read height and both bounds of a window inside: ``(3, rows, columns)`` float64, NaN where unknown."""
-        if self.sigma is None and self.band is None:
+        if not (self.sigma or self.band):
             bands = read_layers(self.path, window).astype(np.float64)
             return np.where(bands[3] == 0, np.nan, bands[:3])  # filled and flattened cells were not measured
         height = read_heights(self.path, self.place, self.shape, window)
         height[~is_ground(height)] = np.nan  # undeclared no data
-        half = self.deviations * (_sigma_of(self.path, window, self.band) if self.band else self.sigma or 0.0)
+        sigma = self.sigma or read_heights(self.path, self.place, self.shape, window, band=self.band)
+        half = self.deviations * np.where(sigma > 0, sigma, np.nan)
         return np.stack([height, height - half, height + half])
 
     def drawn(self, place: Georeferencing, shape: tuple[int, int]) -> np.ndarray:
@@ -72,16 +71,6 @@ class Epoch:
         return np.asarray(found.reshape(3, *shape))
 
 
-def _sigma_of(path: Path, window: Window, band: int) -> np.ndarray:
-    """Read standard deviations, scaled, NaN where they are unknown or not positive."""
-    with opened(str(path), window) as dataset:
-        values = dataset.read(
-            band, window=RasterioWindow(window.column, window.row, window.width, window.height), masked=True
-        )
-        sigma = values.astype(np.float64).filled(np.nan) * dataset.scales[band - 1] + dataset.offsets[band - 1]
-    return np.where(sigma > 0, sigma, np.nan)
-
-
 def open_epoch(path: str | Path, sigma: float | None = None) -> Epoch:
     """Open a surface model, or the folder that has it as dsm.tif; ``sigma`` in metres is for those without bounds."""
     path = path_of(path) / "dsm.tif" if path_of(path).is_dir() else path_of(path)
@@ -89,8 +78,6 @@ def open_epoch(path: str | Path, sigma: float | None = None) -> Epoch:
     assert place.crs is not None
     if not place.crs.is_projected or place.crs.linear_units_factor[1] != 1:
         raise SatIntervalsError(f"{path} is on no map in metres: resample it to one, such as with gdalwarp")
-    if min(shape) < _LEAST:
-        raise SatIntervalsError(f"{path} has {shape[0]} x {shape[1]} cells: give a surface")
     with opened(str(path)) as dataset:
         names, tags = dataset.descriptions, dataset.tags()
     level = tags.get("HEIGHTS", "")
@@ -98,14 +85,11 @@ def open_epoch(path: str | Path, sigma: float | None = None) -> Epoch:
         if "COVERAGE" not in tags:
             raise SatIntervalsError(f"{path} has no bounds with a coverage: make it of runs with --coverage")
         return Epoch(path, shape, place, level, float(tags["COVERAGE"]))
-    if is_change(path):
-        raise SatIntervalsError(f"{path} is a change of height: give surfaces")
-    bands = [
-        n for n, name in enumerate(names, 1) if n > 1 and any(word in (name or "").lower() for word in _DEVIATIONS)
-    ]
-    if sigma is None and not bands:
+    named = [n for n, name in enumerate(names, 1) for word in _DEVIATIONS if n > 1 and word in (name or "").lower()]
+    band = named[0] if named and sigma is None else 0
+    if not (sigma or band):
         raise SatIntervalsError(
             f"{path} has neither bounds nor a band named sigma: give --sigma, the standard deviation of its heights"
         )
     warn_of_no_data(path)
-    return Epoch(path, shape, place, level, _COVERAGE, sigma, None if sigma is not None else bands[0])
+    return Epoch(path, shape, place, level, _COVERAGE, sigma, band)

@@ -14,7 +14,7 @@ from rasterio.warp import calculate_default_transform, reproject, transform_boun
 from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.products import CHANGE, SURFACE
+from sat_intervals.products import SURFACE
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.heightfield import is_ground, other_unit, warn_of_no_data
@@ -32,12 +32,6 @@ def surface_place(path: Path) -> tuple[tuple[int, int], Georeferencing]:
         if dataset.descriptions != tuple(band.name for band in SURFACE):
             raise SatIntervalsError(f"{path} is not a surface model of sat-intervals dsm: give one, or make it again")
     return read_place(path)
-
-
-def is_change(path: Path) -> bool:
-    """Return whether a file has the bands of a change of height."""
-    with opened(str(path)) as dataset:
-        return tuple(dataset.descriptions) == tuple(band.name for band in CHANGE)
 
 
 def read_place(path: Path, *, is_flat: bool = True) -> tuple[tuple[int, int], Georeferencing]:
@@ -117,9 +111,9 @@ def covered_window(path: Path, place: Georeferencing, shape: tuple[int, int]) ->
 
 
 def read_heights(
-    path: Path, place: Georeferencing, shape: tuple[int, int], window: Window, *, smooth: bool = False
+    path: Path, place: Georeferencing, shape: tuple[int, int], window: Window, *, smooth: bool = False, band: int = 1
 ) -> np.ndarray:
-    """Read band 1, scaled, at the cells of a window, NaN if unknown; interpolated if ``smooth``, else the nearest."""
+    """Read a band, scaled, at the cells of a window, NaN if unknown; interpolated if ``smooth``, else the nearest."""
     height, width = shape
     grid = {"crs": place.crs, "transform": place.transform, "height": height, "width": width}
     grid |= {"resampling": Resampling.bilinear if smooth else Resampling.nearest}
@@ -127,14 +121,14 @@ def read_heights(
     with opened(str(path), window) as dataset:
         try:
             with WarpedVRT(dataset, dtype="float64", nodata=np.nan, **grid) as warped:
-                values = warped.read(1, window=area)
+                values = warped.read(band, window=area)
             # GDAL ignores the mask of a raster with a no-data value
-            if dataset.nodata is not None and MaskFlags.per_dataset in dataset.mask_flag_enums[0]:
+            if dataset.nodata is not None and MaskFlags.per_dataset in dataset.mask_flag_enums[band - 1]:
                 with WarpedVRT(dataset, src_nodata=None, dtype="float64", nodata=np.nan, **grid) as masked:
-                    values[masked.read(1, window=area) != values] = np.nan  # also where one of both was interpolated
+                    values[masked.read(band, window=area) != values] = np.nan  # also where one of both was interpolated
         except gdal.GDAL_ERRORS as error:
             raise SatIntervalsError(f"{path} cannot be resampled to the surface: {gdal.reason(error)}") from error
-        return np.asarray(values * dataset.scales[0] + dataset.offsets[0])
+        return np.asarray(values * dataset.scales[band - 1] + dataset.offsets[band - 1])
 
 
 def ground_of(path: Path, bounds: Bounds, around: float) -> tuple[np.ndarray, Georeferencing]:

@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.raster import new_file
+from sat_intervals.raster import Georeferencing, new_file
 
 try:
     from matplotlib import rc_context
@@ -45,6 +45,12 @@ class PlotFrame(NamedTuple):
     def of(cls, shape: tuple[int, int]) -> "PlotFrame":
         """Return the frame of rows and columns."""
         return cls(-0.5, shape[1] - 0.5, shape[0] - 0.5, -0.5)
+
+    @classmethod
+    def on_map(cls, place: Georeferencing, shape: tuple[int, int]) -> "PlotFrame":
+        """Return the frame of a north-up raster."""
+        grid = place.affine
+        return cls(grid.c, grid.c + shape[1] * grid.a, grid.f + shape[0] * grid.e, grid.f, GROUND)
 
 
 class MapLayer(NamedTuple):

@@ -30,9 +30,7 @@ def draw_surface(surface: Path, target: Path, dpi: int = canvas.DPI) -> None:
     height = bands["height"].astype(np.float64)
     halves = (bands["height_upper"] - bands["height_lower"]) / 2
     across, down = place.pixel_size[0] * shape[1] / drawn[1], place.pixel_size[1] * shape[0] / drawn[0]
-    left, top = place.affine.c, place.affine.f
-    ends = left + shape[1] * place.pixel_size[0], top - shape[0] * place.pixel_size[1]
-    frame = canvas.PlotFrame(left, *ends, top, canvas.GROUND)
+    frame = canvas.PlotFrame.on_map(place, shape)
     middle, end = _middle_and_end(halves)
     layers = _layers(height, halves, bands, end)
     step = "" if drawn == shape else f", {drawn[0]} x {drawn[1]} of them drawn"

@@ -7,13 +7,14 @@ from typing import Any
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.accuracy import LARGEST
 from sat_intervals.evaluate.change import open_pair
-from sat_intervals.evaluate.change_areas import Areas, signs_of, stable_ground
-from sat_intervals.heights.polygons import write_polygons
+from sat_intervals.evaluate.change_areas import ChangedAreas, signs_of
+from sat_intervals.heights.polygons import read_areas, write_polygons
 from sat_intervals.kernels.significance import SCALE
 from sat_intervals.products import plain
 from sat_intervals.progress import Progress
 from sat_intervals.raster import OutputWriter, check_free, check_not_replaced, path_of
 from sat_intervals.raster.files import change_file
+from sat_intervals.raster.polygons import outlines
 from sat_intervals.raster.publishing import write_record
 
 FILES = "change.tif", "changes.gpkg", "change.json"
@@ -78,16 +79,14 @@ def change(
     _check(false_alarms, smallest_area, sigma)
     for name in FILES:
         check_free(out / name, overwrite=overwrite)
-    pair, warnings = open_pair(before, after, sigma, registers=registers)
+    pair, registration, warnings = open_pair(before, after, sigma, registers=registers)
     one, other = pair.before, pair.after
-    given = [one.path, other.path, *([stable] if stable else [])]
-    check_not_replaced(given, [out / name for name in FILES])
-    signs, counts = signs_of(pair, false_alarms, stable_ground(stable, pair))
+    check_not_replaced([one.path, other.path, stable], [out / name for name in FILES])
+    ground = read_areas(stable).on(one.place, one.shape) if stable else None
+    signs, counts = signs_of(pair, false_alarms, ground)
     if stable and not counts["stable"]:
-        raise SatIntervalsError(
-            f"{stable} has no ground that both surfaces have: give polygons or a raster of the place"
-        )
-    areas = Areas(pair, signs, smallest_area)
+        raise SatIntervalsError(f"{stable} has no ground that both surfaces have: give one of the place")
+    areas = ChangedAreas(pair, signs, smallest_area)
     tags = {
         "SOFTWARE": "sat-intervals", "BEFORE": str(one.path), "AFTER": str(other.path), "COVERAGE": f"{one.coverage:g}",
         "HEIGHTS": one.level or other.level or "unknown", "FALSE_ALARMS": f"{false_alarms:g}",
@@ -98,19 +97,18 @@ def change(
             writer.write(window.row, areas.add(window))
             progress("change", window.row_stop, one.shape[0])
         writer.publish()
-    figures = areas.figures()
+    figures, found = areas.report()
     if find_spec("pyogrio") and find_spec("shapely"):
-        write_polygons(out / FILES[1], list(areas.outlines()), figures, one.place)
+        write_polygons(out / FILES[1], outlines(areas.labels, one.place), figures, one.place)
     else:
         (out / FILES[1]).unlink(missing_ok=True)  # never beside files of another change
         warnings.append(f"{FILES[1]} is not written: it needs pip install 'sat-intervals[reference]'")
     measured = counts["false"] / counts["stable"] if counts["stable"] else None
     rate = {"named": false_alarms, "measured": measured, "stable": counts["stable"], "median": pair.median}
-    found = areas.report(figures)
     compared = {"compared": counts["compared"], "undecided": signs.size - counts["compared"]}
     report: dict[str, Any] = plain({
         "software": "sat-intervals", "before": one.path, "after": other.path, "smallest_area": smallest_area,
-        "coverage": one.coverage, "cell": one.place.pixel_size[0], "registration": pair.registration, "rate": rate,
+        "coverage": one.coverage, "cell": one.place.pixel_size[0], "registration": registration, "rate": rate,
         "correlation": pair.correlation._asdict(), **found, "cells": compared | found["cells"],
         "warnings": warnings + _rate_warnings(rate, pair.scale),
     })  # fmt: skip
@@ -130,11 +128,11 @@ def _check(false_alarms: float, smallest_area: float, sigma: float | None) -> No
 
 def _rate_warnings(rate: dict[str, Any], scale: float) -> list[str]:
     """Return warnings of more false alarms than named, or differences wider than intervals allow."""
-    found = []
-    if rate["measured"] is not None and rate["measured"] > _DOUBTFUL * rate["named"]:
+    named, measured, found = rate["named"], rate["measured"] or 0.0, []
+    if measured > _DOUBTFUL * named:
         found.append(
-            f"{100 * rate['measured']:.2g} % of the stable ground count as changed, {100 * rate['named']:g} % were to: "
-            "its heights changed, or intervals are too narrow there: calibrate them with calibrate --dsm"
+            f"{100 * measured:.2g} % of the stable ground count as changed, {100 * named:g} % were to: its heights "
+            "changed, or intervals are too narrow there: calibrate them with calibrate --dsm"
         )
     if rate["median"] > _STATED:
         found.append(

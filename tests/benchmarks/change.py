@@ -24,10 +24,10 @@ import sat_intervals
 from sat_intervals import demo, match_pair
 from sat_intervals.demo import OVER, PIXEL
 from sat_intervals.evaluate.change import open_pair
-from sat_intervals.evaluate.change_areas import Areas, signs_of, stable_ground
+from sat_intervals.evaluate.change_areas import ChangedAreas, signs_of
 from sat_intervals.heights.dsm import make_surface
 from sat_intervals.heights.geometry import set_geometry
-from sat_intervals.kernels.change import connected, painted
+from sat_intervals.kernels.components import components
 from sat_intervals.raster import north_up, write_layer
 from sat_intervals.tiling import Window
 
@@ -59,18 +59,18 @@ def surface_of(images):
 
 
 def blobs(changed, height, smallest):
-    """Labels of areas of at least so many cells, those that rose and those that fell, and their number."""
-    labels = np.zeros(height.shape, np.int32)
-    for sign in (1, -1):
-        runs = connected((2 * changed * np.sign(np.nan_to_num(height))).astype(np.int8), sign, smallest)
-        found = painted(*runs, (0, 0, *height.shape))
-        labels += np.where(found > 0, found + labels.max(), 0)
-    return labels
+    """Areas of at least so many cells, their numbers from 1."""
+    labels = components(np.sign(np.nan_to_num(height)), changed)
+    sizes = np.bincount(labels.ravel())
+    kept = np.flatnonzero(sizes[1:] >= smallest) + 1
+    numbers = np.zeros(sizes.size, np.int32)
+    numbers[kept] = 1 + np.arange(kept.size)
+    return numbers[labels]
 
 
 def compared(one, other):
     """Pair of two surfaces, its differences and their bands."""
-    pair, _ = open_pair(one, other, None, registers=True)
+    pair, *_ = open_pair(one, other, None, registers=True)
     found = pair.read(Window(0, 0, *pair.before.shape))
     return pair, found, pair.bands(found)
 
@@ -172,10 +172,10 @@ def scenes():
 
 def areas_of(pair):
     """Labels of the areas of change of a pair, and their figures."""
-    signs, _ = signs_of(pair, RATES[2], stable_ground(None, pair))
-    areas, whole = Areas(pair, signs, SMALLEST), Window(0, 0, *pair.before.shape)
-    areas.add(whole)
-    return areas.labels(whole), areas.figures()
+    signs, _ = signs_of(pair, RATES[2], None)
+    areas = ChangedAreas(pair, signs, SMALLEST)
+    areas.add(Window(0, 0, *pair.before.shape))
+    return areas.labels, areas.report()[0]
 
 
 def power():

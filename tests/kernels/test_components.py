@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sat_intervals.kernels.components import component_sizes
+from sat_intervals.kernels.components import component_sizes, components
 
 
 def slow_sizes(disparity, known):
@@ -36,3 +36,17 @@ def test_component_sizes__equals_the_slow_twin(seed, share):
     disparity = random.integers(0, 4, (5, 7)).astype(np.float32)
     known = random.random(disparity.shape) < share
     np.testing.assert_array_equal(component_sizes(disparity, known), slow_sizes(disparity, known))
+
+
+@settings(derandomize=True, max_examples=30)
+@given(st.integers(0, 2**32 - 1), st.floats(0.2, 1))
+def test_components__have_numbers_in_the_order_of_their_first_pixels(seed, share):
+    random = np.random.default_rng(seed)
+    signs = (random.integers(-2, 3, (5, 7)) * (random.random((5, 7)) < share)).astype(np.int8)
+    labels = components(signs, signs != 0)
+    numbers, first = np.unique(labels[signs != 0], return_index=True)
+    assert numbers.tolist() == list(range(1, numbers.size + 1))
+    assert (np.diff(first) > 0).all()
+    assert all((np.sign(signs[labels == one]) == np.sign(signs[labels == one][0])).all() for one in numbers)
+    sizes = np.bincount(labels.ravel())[labels] * (signs != 0)
+    np.testing.assert_array_equal(sizes, slow_sizes(signs, signs != 0))

@@ -13,7 +13,7 @@ from surfaces import PLACE, write_raster, write_surface
 
 import sat_intervals
 from sat_intervals.evaluate.change import open_pair
-from sat_intervals.evaluate.change_areas import Areas, signs_of, stable_ground
+from sat_intervals.evaluate.change_areas import ChangedAreas, signs_of
 from sat_intervals.kernels import registration
 from sat_intervals.products import SURFACE
 from sat_intervals.raster import read_layers
@@ -187,17 +187,17 @@ def test_areas__volumes_have_the_error_of_the_shift_on_slopes(tmp_path):
         height = ramp.copy()
         height[20:60, 20:60] += rise
         write_surface(tmp_path / f"{name}.tif", height, height - HALF, height + HALF, TAGS)
-    pair, _ = open_pair(tmp_path / "before.tif", tmp_path / "after.tif", None, registers=False)
+    pair, *_ = open_pair(tmp_path / "before.tif", tmp_path / "after.tif", None, registers=False)
     found = {}
     for deviation in (0.0, 0.25):
-        moved = replace(pair, registration={"shift": (0, 0, 0), "deviation": (deviation, deviation, 0.0)})
-        signs, _ = signs_of(moved, 0.01, stable_ground(None, moved))
-        areas = Areas(moved, signs, 50)
+        moved = replace(pair, shift=np.array([[0, 0, 0], [deviation, deviation, 0]]))
+        signs, _ = signs_of(moved, 0.01, None)
+        areas = ChangedAreas(moved, signs, 50)
         for window in moved.strips():
             areas.add(window)
-        figures = areas.figures()
+        figures, found_in_all = areas.report()
         found[deviation] = float(figures["volume_deviation"][0] / figures["area"][0])
-        total = areas.report(figures)["volume"]["gained"][1]
+        total = found_in_all["volume"]["gained"][1]
         assert total == pytest.approx(float(figures["volume_deviation"][0]), rel=1e-6)
     assert found[0.25] > 0.12 > 3 * found[0.0]
 
@@ -229,7 +229,7 @@ def test_change__refuses_in_one_line(dates, changed, tmp_path):
     feet = write_date(tmp_path / "feet.tif", 1, crs="EPSG:2236")
     refused(["change", before, feet, tmp_path], "feet.tif is on no map in metres")
     refused(["change", before, after, tmp_path, "--sigma", 1], "both surfaces have bounds: leave sigma out")
-    refused(["change", before, dates / "out" / "change.tif", tmp_path], "is a change of height: give surfaces")
+    refused(["change", before, dates / "out" / "change.tif", tmp_path], "change.tif has neither bounds nor")
     elsewhere = write_raster(tmp_path / "elsewhere.tif", np.ones((1, 9, 9)), PLACE @ Affine.translation(9000, 0))
     refused(["change", before, after, tmp_path / "new", "--stable", elsewhere], "elsewhere.tif has no ground that both")
 
