@@ -70,6 +70,11 @@ _CELL_OPTIONS = (
     ),
     click.option("--flatten", type=options.FILE, help="Polygons or a raster, not 0 inside: areas of one height."),
     click.option("--mask", type=options.FILE, help="Polygons or a raster, not 0 inside: areas of no data."),
+    click.option(
+        "--ortho",
+        is_flag=True,
+        help="Write ortho.tif beside it: both raw images, of many their median, on its grid.",
+    ),
 )
 
 
@@ -91,8 +96,8 @@ def cell_options(command: options.Command) -> options.Command:
 
     @wraps(command)
     def with_cells(**given: Any) -> Any:
-        names = ("bounds", "keeps_open", "keeps_border", "outliers", "max_width", "min_confidence", "flatten", "mask")
-        choices = {name: given.pop(name) for name in names}
+        names = "bounds keeps_open keeps_border outliers max_width min_confidence flatten mask ortho"
+        choices = {name: given.pop(name) for name in names.split()}
         distance = given.pop("fill_distance")
         fills = given.pop("fills")
         choices["fill"] = _FILL_DISTANCE if fills and distance is None else distance
@@ -119,14 +124,10 @@ def calibration_option(*names: str) -> Callable[[options.Command], options.Comma
     )
 
 
-ortho_option = click.option(
-    "--ortho", is_flag=True, help="Write ortho.tif beside it: the raw left image, of many their median, on its grid."
-)
-
-
 def say_surface(console: "Console", report: dict[str, Any]) -> None:
     """Print what a surface has: cells, filled share, half widths, and what was left out."""
     from sat_intervals.cli.console import say_completed
+    from sat_intervals.cli.tables import shift_of
     from sat_intervals.heights.cells import WIDE
 
     say_geometry(console, report["geometry"])
@@ -150,13 +151,7 @@ def say_surface(console: "Console", report: dict[str, Any]) -> None:
             console.say(f"{report[name]} {what}")
     say_completed(console, report["completed"])
     for found in report["shifts"]:
-        shift = ", ".join(
-            f"{axis} {value:+.2f} m" + (" (unknown)" if deviation is None else f" (standard deviation {deviation:.2g})")
-            for axis, value, deviation in zip(
-                ("easting", "northing", "height"), found["shift"], found["deviation"], strict=True
-            )
-        )
-        console.say(f"{found['run']} moved: {shift}")
+        console.say(f"{found['run']} moved: {shift_of(found)}")
         if abs(up := found["shift"][2]) > _OTHER_DATUM:
             warn([f"{found['run']} moved by {up:.0f} m in height, as if of another datum: check what heights refer to"])
     if (share := report["disagreeing"]) is not None:
@@ -177,7 +172,6 @@ def say_surface(console: "Console", report: dict[str, Any]) -> None:
 @click.option(
     "--reference", type=options.FILE, help="Raster of heights, above the same datum, that each OUT is moved onto."
 )
-@ortho_option
 @click.option("--output", type=options.FILE, help="File to write; default dsm.tif in the first OUT.")
 @options.overwrite_option
 @options.sensor_options
@@ -187,7 +181,6 @@ def dsm(
     cells: dict[str, Any],
     aligns: bool,
     reference: Path | None,
-    ortho: bool,
     output: Path | None,
     overwrite: bool,
     sensor_files: list[options.SensorFiles],
@@ -216,16 +209,16 @@ def dsm(
     from sat_intervals.raster.publishing import check_free
     from sat_intervals.run.status import runs_of
 
-    if ortho and output:
+    choices = replace(cells["choices"], aligns=aligns, reference=reference)
+    if choices.ortho and output:
         check_free(output.with_name("ortho.tif"), overwrite=overwrite)
     output = options.output_file(output, outs[0] / "dsm.tif", overwrite=overwrite)
     outs = tuple(run for out in outs for run in runs_of(out))
-    cells["choices"] = replace(cells["choices"], aligns=aligns, reference=reference, ortho=ortho)
     with printing.console() as console:
         options.note_geometry(outs, sensor_files)
-        report = make_surface(outs, output, **cells, progress=console.progress)
+        report = make_surface(outs, output, **(cells | {"choices": choices}), progress=console.progress)
     printing.say(report)
     say_surface(console, report)
     console.say(str(output))
-    if ortho:
+    if choices.ortho:
         console.say(str(output.with_name("ortho.tif")))

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from sat_intervals.cli.dsm import calibration_option, cell_options, ortho_option, say_surface
+from sat_intervals.cli.dsm import calibration_option, cell_options, say_surface
 from sat_intervals.cli.images import PairArguments, ground_options, many_options
 from sat_intervals.cli.matching import RunArguments, SettingsArguments, run_options, search_options
 from sat_intervals.cli.options import FILE, Grouped, sensor_options
@@ -22,7 +22,6 @@ from sat_intervals.cli.rectify import raw_options, say_rectified
 @cell_options
 @calibration_option("--height-calibration")
 @ground_options
-@ortho_option
 @run_options
 def surface(
     pair: PairArguments,
@@ -31,7 +30,6 @@ def surface(
     raw: dict[str, Any],
     cells: dict[str, Any],
     ground: dict[str, Any],
-    ortho: bool,
     settings: SettingsArguments,
     run: RunArguments,
 ) -> None:
@@ -64,7 +62,6 @@ def surface(
             out,
             config,
             **(cells | raw | ground),
-            ortho=ortho,
             sensors=sensor_files[0] if sensor_files else (),
             window=pair.window,
             keep_tiles=run.keep_tiles,
@@ -79,6 +76,6 @@ def surface(
         console.summary(done["run"], out)
         say_surface(console, done["surface"])
         console.say(str(out / "dsm.tif"))
-    if ortho:
+    if cells["choices"].ortho:
         console.say(str(out / "ortho.tif"))
     run.check_strict(done["warnings"])

@@ -205,21 +205,27 @@ def change_lines(report: dict[str, Any]) -> list[str]:
     ]
 
 
+def shift_of(found: dict[str, Any]) -> str:
+    """Return a shift in words, with standard deviations where they are known."""
+    named = zip(("easting", "northing", "height"), found["shift"], found["deviation"], strict=True)
+    return ", ".join(
+        f"{axis} {value:+.2f} m" + ("" if deviation is None else f" (standard deviation {deviation:.2g})")
+        for axis, value, deviation in named
+    )
+
+
 def registration_lines(found: dict[str, Any] | None, moved: str = "reference") -> list[str]:
     """Return lines for the user about a registration: the shift, and figures before and after it."""
     if found is None:
         return []
-    east, north, up = (
-        f"{value:+.2f} m" + ("" if deviation is None else f" (standard deviation {deviation:.2g})")
-        for value, deviation in zip(found["shift"], found["deviation"], strict=True)
-    )
-    lines = [f"{moved} moved: easting {east}, northing {north}, height {up}"]
+    shift = shift_of(found)
+    lines = [f"{moved} moved: {shift}"]
     if not any(found["shift"]) and found["is_horizontal"]:
         deviations = ", ".join(f"{value:.2g} m" for value in found["deviation"])
         lines = [f"{moved} not moved: its shift is less than two standard deviations, {deviations}"]
     if not found["is_horizontal"]:
         lines = [
-            f"{moved} moved: height {up}; easting and northing cannot be determined: flat ground, or a "
+            f"{moved} moved: {shift.rpartition(', ')[2]}; easting and northing cannot be determined: flat ground, or a "
             f"{moved} many cells off"
         ]
     for when in ("before", "after"):

@@ -139,6 +139,13 @@ def strips(height: int, width: int, pixels: int) -> Iterator[Window]:
         yield Window(row, 0, min(rows, height - row), width)
 
 
+def strips_of_windows(shape: tuple[int, int], rows: int, columns: int) -> Iterator[list[Window]]:
+    """Yield the windows of strips from the top, of at most so many rows and columns."""
+    whole = Window(0, 0, *shape)
+    for row in range(0, shape[0], rows):
+        yield [Window(row, column, rows, columns).clipped(whole) for column in range(0, shape[1], columns)]
+
+
 def hull(windows: Sequence[Window]) -> Window:
     """Return the smallest window that contains all windows."""
     row, column = min(window.row for window in windows), min(window.column for window in windows)

@@ -10,6 +10,7 @@ import numpy as np
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.comparison import Comparison, check_common, registered
 from sat_intervals.kernels.significance import MEDIAN, SCALE, Correlation, correlation_of, probability, ratio_of
+from sat_intervals.kernels.slopes import rises
 from sat_intervals.raster.epochs import Epoch, open_epoch
 from sat_intervals.raster.surfaces import check_reference, covered_window, resolution_of
 from sat_intervals.tiling import Grid, Window, strips
@@ -71,7 +72,7 @@ class Pair:
         )
         one, other = self.before.deviations, self.after.deviations
         cell = self.before.place.affine
-        slopes = np.stack([_slope(ground[0], 1)[inner] / cell.a, _slope(ground[0], 0)[inner] / cell.e])
+        slopes = np.stack([rises(ground[0], 1)[inner] / cell.a, rises(ground[0], 0)[inner] / cell.e])
         shift = deviation[2] ** 2 + (deviation[0] * slopes[0]) ** 2 + (deviation[1] * slopes[1]) ** 2
         return Difference(
             then - height,
@@ -85,13 +86,6 @@ class Pair:
         half = ratio_of(1 - self.before.coverage, self.scale)
         bounds = found.height - half * found.down, found.height + half * found.up
         return np.stack([found.height, *bounds, probability(found.ratio, self.scale)])
-
-
-def _slope(height: np.ndarray, axis: int) -> np.ndarray:
-    """Return the slope along an axis for a cell: the mean of those to both neighbours, or that to a known one, or 0."""
-    ends = [np.diff(height, axis=axis, prepend=np.nan), np.diff(height, axis=axis, append=np.nan)]
-    known = np.isfinite(ends).sum(axis=0)
-    return np.asarray(np.nansum(ends, axis=0) / np.maximum(known, 1))
 
 
 def open_pair(

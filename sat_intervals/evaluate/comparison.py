@@ -12,7 +12,7 @@ from sat_intervals.evaluate.accuracy import BLOCKS, LARGEST, Heights
 from sat_intervals.evaluate.points import blocks_of, cells_of, read_points
 from sat_intervals.heights.point_files import ENDINGS
 from sat_intervals.kernels.conformal import AROUND, relief_of
-from sat_intervals.kernels.registration import REACH, Blocks, every_nth, put_together, register, spread_blocks
+from sat_intervals.kernels.registration import REACH, Blocks, part_of, put_together, register, spread_blocks
 from sat_intervals.kernels.relief import sampled
 from sat_intervals.raster import GROUND, Georeferencing, path_of, read_heights, read_layers, read_place, read_tags
 from sat_intervals.raster.heightfield import warn_of_no_data
@@ -221,10 +221,7 @@ def _blocks_of_raster(given: Comparison) -> Blocks | None:
     parts = []
     for core in spread_blocks(given.area, _SMALLEST):
         height = read_heights(given.surface, given.place, given.shape, core)
-        row, column = np.nonzero(np.isfinite(height))
-        if row.size:
-            chosen = every_nth(row.size)
-            row, column = row[chosen], column[chosen]
+        if np.isfinite(height).any():
             surface = given.heights(*given.cells(core.grown(REACH + 1, REACH + 1)), smooth=True)
-            parts.append((surface, column + REACH + 1.0, row + REACH + 1.0, height[row, column]))
+            parts.append(part_of(surface, height))
     return put_together(parts, given.cell, moves=1)

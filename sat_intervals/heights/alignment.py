@@ -17,7 +17,7 @@ import numpy as np
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.point_cloud import Cells, PointCloud
 from sat_intervals.kernels.gridding import mean_heights
-from sat_intervals.kernels.registration import REACH, Registration, every_nth, put_together, register, spread_blocks
+from sat_intervals.kernels.registration import REACH, Registration, part_of, put_together, register, spread_blocks
 from sat_intervals.raster import is_ground, north_up, read_heights
 from sat_intervals.tiling import Window
 
@@ -25,8 +25,7 @@ from sat_intervals.tiling import Window
 _SMALLEST = 16
 # What pulls the mean of all shifts to 0, or the reference, in inverse metres.
 _HELD = 1e3
-# Metres: least deviation of a shift, and heights that differ by more are of other units.
-_LEAST, _FAR = 0.01, 500.0
+_LEAST = 0.01  # metres: least deviation of a shift
 
 
 def aligned(
@@ -40,7 +39,7 @@ def aligned(
     """Move the points of runs onto each other, or onto a raster of reference heights.
 
     Also return the shift of each run, easting, northing and height in metres, with its ``deviation``, None if unknown.
-    Raises `SatIntervalsError` for a run that has no ground with the reference, or is far from it.
+    Raises `SatIntervalsError` for a run that has no ground with the reference.
     """
     count = len(clouds) + bool(reference)
     heights_only = [PointCloud(one.run, one.ground.lattice, replace(one.choices, bounds="envelope")) for one in clouds]
@@ -48,16 +47,15 @@ def aligned(
     cores = spread_blocks(Window(0, 0, cells.rows, cells.columns), _SMALLEST)
     for heights in threads.map(lambda core: list(_heights(heights_only, cells, crs, radius, reference, core)), cores):
         for one, other in combinations(range(count), 2):
-            part = _part(heights[one], heights[other])
-            if part is not None:
-                found.setdefault((one, other), []).append(part)
+            inner = heights[other][REACH + 1 : -REACH - 1, REACH + 1 : -REACH - 1]
+            found.setdefault((one, other), []).append(part_of(heights[one], inner))
     pairs = {pair: register(put_together(parts, cells.resolution, moves=-1)) for pair, parts in found.items()}
     known = {pair: one for pair, one in pairs.items() if one}
     shifts, deviations = solved(known, count, has_reference=bool(reference))
-    if reference:
-        _check(clouds, shifts, deviations, reference)
     moved, report = [], []
     for cloud, shift, deviation in zip(clouds, shifts, deviations, strict=False):
+        if reference and np.isnan(deviation[2]):
+            raise SatIntervalsError(f"{cloud.run.out} has no ground with {reference}: give a reference of this place")
         lattice = cloud.ground.lattice
         moved.append(PointCloud(cloud.run, replace(lattice, nodes=lattice.nodes + shift), cloud.choices))
         known_deviation = [one if np.isfinite(one) else None for one in deviation.tolist()]
@@ -78,16 +76,6 @@ def _heights(
         shape = around.height, around.width
         heights = read_heights(reference, place, shape, Window(0, 0, *shape), smooth=True)
         yield np.where(is_ground(heights), heights, np.nan).astype(np.float32)
-
-
-def _part(surface: np.ndarray, heights: np.ndarray) -> tuple[np.ndarray, ...] | None:
-    """Return a surface with columns, rows and heights of points of another one on the block, None without any."""
-    row, column = np.nonzero(np.isfinite(heights[REACH + 1 : -REACH - 1, REACH + 1 : -REACH - 1]))
-    if not (row.size and np.isfinite(surface).any()):
-        return None
-    chosen = every_nth(row.size)
-    row, column = row[chosen] + REACH + 1, column[chosen] + REACH + 1
-    return surface, column.astype(float), row.astype(float), heights[row, column]
 
 
 def solved(
@@ -114,15 +102,3 @@ def solved(
             met = sorted(linked)
             deviations[met, axis] = np.sqrt(np.square(inverse).sum(axis=1))[met]
     return shifts, deviations
-
-
-def _check(clouds: Sequence[PointCloud], shifts: np.ndarray, deviations: np.ndarray, reference: Path) -> None:
-    """Raise for a run whose height is not known from the reference, or is far from it."""
-    for cloud, (*_, up), (*_, deviation) in zip(clouds, shifts, deviations, strict=False):
-        if np.isnan(deviation):
-            raise SatIntervalsError(f"{cloud.run.out} has no ground with {reference}: give a reference of this place")
-        if abs(up) > _FAR:
-            raise SatIntervalsError(
-                f"{cloud.run.out} and {reference} differ by {up:.0f} m in height: check that both are metres above the "
-                "same datum"
-            )

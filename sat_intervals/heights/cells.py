@@ -16,7 +16,7 @@ from sat_intervals.kernels.conformal import AROUND, Margins, outwards, relief_of
 from sat_intervals.kernels.gridding import BOUNDED, CONFIDENCE, COUNT, HEIGHT, LOWER, UPPER, WEIGHT
 from sat_intervals.match.histogram import Histogram
 from sat_intervals.products import SURFACE
-from sat_intervals.tiling import Window
+from sat_intervals.tiling import Window, strips_of_windows
 
 _TILE = 1024  # side of a tile in cells: some hundred megabytes
 # Cells of a strip of tiles, 24 bytes each, a few strips in memory; tiles of wide surfaces have fewer rows.
@@ -78,12 +78,8 @@ def _strips(
         return row, np.concatenate(bands, axis=2), sum(counts, Counter())
 
     try:
-        for row in range(0, cells.rows, rows):
-            windows = (
-                Window(row, column, rows, columns).clipped(Window(0, 0, cells.rows, cells.columns))
-                for column in range(0, cells.columns, columns)
-            )
-            running.append((row, [threads.submit(tile, window) for window in windows]))
+        for windows in strips_of_windows((cells.rows, cells.columns), rows, columns):
+            running.append((windows[0].row, [threads.submit(tile, window) for window in windows]))
             if len(running) > 1:  # the next strip is computed while this one is written
                 yield finished()
         yield finished()

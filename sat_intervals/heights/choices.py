@@ -12,6 +12,8 @@ from sat_intervals.raster.completion import Completion
 
 Bounds = Literal["envelope", "quantiles"]
 BOUNDS: tuple[Bounds, ...] = get_args(Bounds)
+# Cells to the rim of a void: nearer ones have fewer directions; tiles are read with twice as many around them.
+_REACH = 2, 256
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,8 @@ class SurfaceChoices:
         Whether several runs are moved onto each other first, and a raster of heights, above the same datum, that each
         run is moved onto.
     ortho
-        Whether the raw left image of the first run, resampled to the surface, is written beside it as ``ortho.tif``.
+        Whether ``ortho.tif`` is written beside the surface: the raw images of the first run, of many images their
+        median, resampled to it.
     fill
         Metres up to which voids are filled from their rims. None: voids are no data.
     flatten, mask
@@ -88,10 +91,12 @@ class SurfaceChoices:
         return {"INTERVAL": str(self.bounds), **tags, **({} if self.keeps_open else {"OPEN_POINTS": "left out"})}
 
 
-def completion_of(cell: float, fill: float | None, flatten: Path | None, mask: Path | None) -> Completion | None:
+def completion_of(cell: float, choices: SurfaceChoices) -> Completion | None:
     """Read what completes a surface with cells of a side in metres; None if it stays as it was measured."""
-    if not (fill or flatten or mask):
+    fill, files = choices.fill, (choices.flatten, choices.mask)
+    if not (fill or any(files)):
         return None
-    completion = Completion.of(fill, *(read_areas(path) if path else None for path in (flatten, mask)))
-    completion.check(cell)
-    return completion
+    nearest, farthest = (cells * cell for cells in _REACH)
+    if fill and not nearest <= fill <= farthest:
+        raise SatIntervalsError(f"fill distance is {fill:g} m: give {nearest:g} to {farthest:g} m, 2 to 256 cells")
+    return Completion(fill, *(read_areas(path) if path else None for path in files))

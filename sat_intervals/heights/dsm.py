@@ -90,7 +90,7 @@ def make_surface(
     path, geoid, choices = path_of(path), None if geoid is None else path_of(geoid), choices or SurfaceChoices()
     given = [geoid, choices.flatten, choices.mask, *_files_of(choices.reference), *_files_of(resolution)]
     grid, resolution, crs, radius = checked_cells(resolution, crs, radius, geoid)
-    completion = completion_of(resolution, choices.fill, choices.flatten, choices.mask)
+    completion = completion_of(resolution, choices)
     level = f"above {geoid or 'the WGS 84 ellipsoid'}"
     _check_reference(choices.reference, path, level)
     geometries = _geometries(outs, [path, path.with_name(ORTHO)][: 1 + choices.ortho], given, progress)
@@ -147,7 +147,6 @@ def _write(
     tally, place = CellCounts(), north_up(crs, cells.left, cells.top, cells.resolution)
     file, completed = surface_file(path.name), None
     completion = completion and completion.on(place, (cells.rows, cells.columns))
-    tags |= completion.tags() if completion else {}
     with OutputWriter(path.parent, [file], cells.rows, cells.columns, place, tags) as writer:
         for row, bands, counts in parts:
             tally.add(bands, counts)
@@ -155,7 +154,8 @@ def _write(
             progress("cells", row + bands.shape[1], cells.rows)
         progress("files", 0, 1)
         if completion:
-            completed = complete(writer.build()[file.name], file, place, tags, completion, progress)
+            made = writer.build()[file.name]
+            completed = complete(made, made, file, completion, progress)
         writer.publish()
         progress("files", 1, 1)
     return tally.report(cells.rows * cells.columns) | {"completed": completed}

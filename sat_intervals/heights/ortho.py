@@ -1,7 +1,8 @@
 """Resample raw images to a surface: an ortho-image on its grid, without the cells that no image sees."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from sat_intervals.heights.point_cloud import Cells
 from sat_intervals.heights.rectify import raw_inputs
 from sat_intervals.kernels.resampling import resample
 from sat_intervals.kernels.row_offsets import AFTER, BEFORE
+from sat_intervals.machine import usable_cores
 from sat_intervals.match.ground import GroundViews
 from sat_intervals.products import ORTHO, Band
 from sat_intervals.progress import Progress
@@ -26,70 +28,54 @@ from sat_intervals.raster import (
     read_tags,
 )
 from sat_intervals.results import Run, open_input
-from sat_intervals.tiling import View, Window
+from sat_intervals.tiling import View, Window, strips_of_windows
 
 # Rows of a strip, and columns of a window in it.
 _ROWS, _COLUMNS = 128, 1024
 _FEW = 1024  # rows and columns that are read for the range of heights
 
 
-@dataclass(frozen=True)
-class Drape:
-    """Images over a surface.
+def write_orthos(
+    surface: Path, images: Sequence[Image], ground: GroundViews, bands: Sequence[Band], progress: Progress
+) -> None:
+    """Write images, resampled to the surface, beside it: a band of each, or one of medians; replaces a file.
 
-    sights: ``(images, 2)`` cells along rows and columns that a line of sight moves for a metre upwards.
-    heights: range of the heights in metres.
+    ``ground``: where they show the cells of the surface.
     """
+    from sat_intervals.heights.views import towards  # needs the extra `dsm`
 
-    surface: Path
-    images: Sequence[Image]
-    ground: GroundViews
-    sights: np.ndarray
-    heights: tuple[float, float]
+    shape, place = read_place(surface)
+    sights, ends = -towards(ground, place.pixel_size[0]) / place.pixel_size[0], _ends(surface, shape)
+    reach = int(np.ceil(np.abs(sights).max() * (ends[1] - ends[0]))) + 1
 
-    @classmethod
-    def of(cls, surface: Path, images: Sequence[Image], ground: GroundViews) -> "Drape":
-        """Return images over the surface of a file, whose cells ``ground`` has."""
-        from sat_intervals.heights.views import towards  # needs the extra `dsm`
-
-        (rows, columns), place = read_place(surface)
-        ends = _ends(surface, (rows, columns))
-        cell = place.pixel_size[0]
-        return cls(surface, images, ground, -towards(ground, cell) / cell, ends)
-
-    def write(self, meaning: str, progress: Progress) -> None:
-        """Write the ortho-image, the median of the images, beside the surface; an existing file is replaced."""
-        (rows, columns), place = read_place(self.surface)
-        file = File(ORTHO, "float32", float("nan"), (Band("grey level", "", meaning),))
-        tags = {"SOFTWARE": "sat-intervals", "RUNS": read_tags(self.surface).get("RUNS", "")}
-        with OutputWriter(self.surface.parent, [file], rows, columns, place, tags) as writer:
-            for row in range(0, rows, _ROWS):
-                progress("ortho", row, rows)
-                height = min(_ROWS, rows - row)
-                windows = [
-                    Window(row, first, height, min(_COLUMNS, columns - first)) for first in range(0, columns, _COLUMNS)
-                ]
-                writer.write(row, np.concatenate([self._window(window) for window in windows], axis=1)[np.newaxis])
-            writer.publish()
-            progress("ortho", rows, rows)
-
-    def _window(self, window: Window) -> np.ndarray:
-        """Return the ortho-image of a window of cells, float32."""
-        reach = int(np.ceil(np.abs(self.sights).max() * (self.heights[1] - self.heights[0]))) + 1
-        around, ground = window.grown(reach, reach), self.ground
-        inside = around.clipped(Window(0, 0, *ground.shape))
+    def tile(window: Window) -> np.ndarray:
+        around = window.grown(reach, reach)
+        inside = around.clipped(Window(0, 0, *shape))
         all_heights = np.full((around.height, around.width), np.float32(np.nan))
-        all_heights[inside.relative_to(around).slices] = read_layers(self.surface, inside, band=1)
+        all_heights[inside.relative_to(around).slices] = read_layers(surface, inside, band=1)
         heights = all_heights[window.relative_to(around).slices]
         known = np.isfinite(heights)
         if not known.any():
-            return heights
+            return np.broadcast_to(heights, (len(bands), *heights.shape))
         disparity = (np.where(known, heights, np.median(heights[known])) - ground.base) / ground.step
-        ends = int(np.floor(disparity.min())), int(np.ceil(disparity.max()))
-        views = read_reduced_views(self.images, ground.windows(window, *ends), ground.reductions)
+        searched = int(np.floor(disparity.min())), int(np.ceil(disparity.max()))
+        views = read_reduced_views(images, ground.windows(window, *searched), ground.reductions)
         found = np.stack([ortho(view, ground.positions(n, window, disparity)) for n, view in enumerate(views)])
-        found[np.stack([hidden(all_heights, heights.shape, sight) for sight in self.sights])] = np.nan
-        return np.where(known, median_of(found), np.float32(np.nan)).astype(np.float32)
+        found[np.stack([hidden(all_heights, heights.shape, sight) for sight in sights])] = np.nan
+        found = found if len(bands) == len(images) else median_of(found)[np.newaxis]
+        return np.where(known, found, np.float32(np.nan)).astype(np.float32)
+
+    tags = {"SOFTWARE": "sat-intervals", "RUNS": read_tags(surface).get("RUNS", "")}
+    file = File(ORTHO, "float32", float("nan"), tuple(bands))
+    with (
+        OutputWriter(surface.parent, [file], *shape, place, tags) as writer,
+        ThreadPoolExecutor(usable_cores()) as threads,
+    ):
+        for windows in strips_of_windows(shape, _ROWS, _COLUMNS):
+            progress("ortho", windows[0].row, shape[0])
+            writer.write(windows[0].row, np.concatenate([*threads.map(tile, windows)], axis=2))
+        writer.publish()
+        progress("ortho", shape[0], shape[0])
 
 
 def _ends(surface: Path, shape: tuple[int, int]) -> tuple[float, float]:
@@ -135,19 +121,18 @@ def hidden(surface: np.ndarray, shape: tuple[int, int], sight: np.ndarray) -> np
 def write_ortho_of(
     run: Run, surface: Path, projection: Projection, shift: tuple[float, float, float], progress: Progress
 ) -> None:
-    """Write the left raw image of a run, whose points were moved by ``shift`` (metres), resampled to a surface."""
+    """Write the raw images of a run, whose points were moved by ``shift`` (metres), resampled to a surface."""
     from sat_intervals.heights.views import sensors_of, views_of  # needs the extra `dsm`
 
-    inputs = raw_inputs(*(run.report["inputs"][side]["path"] for side in ("left", "right")))
-    images = [open_input(inputs[side]) for side in ("left", "right")]
-    left = sensors_of(images, [inputs[f"{side}_model"]["path"] for side in ("left", "right")])[:1]
+    sides = "left", "right"
+    inputs = raw_inputs(*(run.report["inputs"][side]["path"] for side in sides))
+    images = [open_input(inputs[side]) for side in sides]
+    sensors = sensors_of(images, [inputs[f"{side}_model"]["path"] for side in sides])
     (rows, columns), place = read_place(surface)
     east, north, up = shift
     cells = Cells(place.affine.c - east, place.affine.f - north, place.pixel_size[0], rows, columns)
     lowest, highest = _ends(surface, (rows, columns))
-    ends = lowest - up, highest - up + 1
-    ground = views_of(left, projection, cells, ends, np.zeros((1, 2)))
-    ground = replace(ground, lowest=ground.lowest + up)
-    Drape.of(surface, images[:1], ground).write(
-        "left image, resampled to the surface; no data without a height, or where the surface hides the cell", progress
-    )
+    ground = views_of(sensors, projection, cells, (lowest - up, highest - up + 1), np.zeros((2, 2)))
+    meaning = "{} image, resampled to the surface; no data without a height, or where the surface hides the cell"
+    bands = [Band(side, "", meaning.format(side)) for side in sides]
+    write_orthos(surface, images, replace(ground, lowest=ground.lowest + up), bands, progress)

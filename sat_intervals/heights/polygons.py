@@ -9,7 +9,7 @@ import numpy as np
 from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.heights.point_files import reading
 from sat_intervals.raster import Georeferencing
-from sat_intervals.raster.polygons import Areas, Polygon
+from sat_intervals.raster.polygons import Areas, Polygon, areas_of_raster
 from sat_intervals.raster.publishing import write_file
 
 _POLYGON = 3  # type of shapely
@@ -35,7 +35,7 @@ def read_areas(path: Path) -> Areas:
     """Read polygons, or a raster that is not 0 in areas."""
     check_file(path, "give a raster or a file of polygons")
     if path.suffix.lower() not in _VECTORS:
-        return Areas.of_raster(path)
+        return areas_of_raster(path)
     with reading(path, "polygons"):
         import shapely
         from pyogrio.raw import read
@@ -46,4 +46,4 @@ def read_areas(path: Path) -> Areas:
         polygons = [shapely.geometry.mapping(one) for one in found]
     if not known["crs"]:
         raise SatIntervalsError(f"{path} has no CRS: declare it, such as with ogr2ogr -a_srs EPSG:32637")
-    return Areas.of(path, known["crs"], polygons)
+    return Areas(path, known["crs"], polygons)

@@ -47,13 +47,15 @@ class Margins(NamedTuple):
 
 def relief_of(height: np.ndarray) -> np.ndarray:
     """Return the range of the known heights in 5 x 5 cells around each: ``(rows, columns)``, NaN without any."""
-    lowest = highest = np.pad(height, AROUND, constant_values=np.nan)
+    return highest_around(height, AROUND) + highest_around(-height, AROUND)
+
+
+def highest_around(values: np.ndarray, reach: int) -> np.ndarray:
+    """Return the highest known value up to ``reach`` cells around each: ``(rows, columns)`` floats, NaN without any."""
     for axis in (0, 1):
-        lowest, highest = (
-            reduced(sliding_window_view(ends, 2 * AROUND + 1, axis), axis=-1)
-            for reduced, ends in ((np.fmin.reduce, lowest), (np.fmax.reduce, highest))
-        )
-    return np.asarray(highest - lowest)
+        padded = np.pad(values, [(reach, reach) if axis == one else (0, 0) for one in (0, 1)], constant_values=np.nan)
+        values = np.fmax.reduce(sliding_window_view(padded, 2 * reach + 1, axis), axis=-1)
+    return values
 
 
 def least_number(coverage: float, misses: int = 10) -> int:

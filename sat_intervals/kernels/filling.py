@@ -58,24 +58,21 @@ def _inside(height, row, column):
 @part
 def _plane(z, x, y):
     """Return height at 0, 0 of the plane by least squares with weights of 1 / distance^2, and its largest residual."""
-    total = mean_x = mean_y = mean_z = 0.0
-    for k in range(z.size):
-        weight = 1 / (x[k] ** 2 + y[k] ** 2)
-        total += weight
-        mean_x, mean_y, mean_z = mean_x + weight * x[k], mean_y + weight * y[k], mean_z + weight * z[k]
-    mean_x, mean_y, mean_z = mean_x / total, mean_y / total, mean_z / total
-    xx = xy = yy = xz = yz = 0.0
-    for k in range(z.size):
-        weight = 1 / (x[k] ** 2 + y[k] ** 2)
-        a, b, c = x[k] - mean_x, y[k] - mean_y, z[k] - mean_z
-        xx, xy, yy = xx + weight * a * a, xy + weight * a * b, yy + weight * b * b
-        xz, yz = xz + weight * a * c, yz + weight * b * c
+    weight = 1 / (x**2 + y**2)
+    total = weight.sum()
+    mean_x, mean_y, mean_z = (weight * x).sum() / total, (weight * y).sum() / total, (weight * z).sum() / total
+    a, b, c = x - mean_x, y - mean_y, z - mean_z
+    xx, xy, yy = (weight * a * a).sum(), (weight * a * b).sum(), (weight * b * b).sum()
+    xz, yz = (weight * a * c).sum(), (weight * b * c).sum()
     determinant = xx * yy - xy * xy  # of directions all around it is not 0
     east, south = (yy * xz - xy * yz) / determinant, (xx * yz - xy * xz) / determinant
-    away = 0.0
-    for k in range(z.size):
-        away = max(away, abs(z[k] - mean_z - east * (x[k] - mean_x) - south * (y[k] - mean_y)))
-    return mean_z - east * mean_x - south * mean_y, away
+    return mean_z - east * mean_x - south * mean_y, np.abs(c - east * a - south * b).max()
+
+
+@part
+def _larger(mean, of_lowest):
+    """Return the larger of two numbers, NaN if the first is."""
+    return of_lowest if of_lowest > mean else mean
 
 
 @cached
@@ -87,7 +84,7 @@ def filled(height, lower, upper, voids, reach, apart):
     reach: cells to the rim at most; ``apart``: metres from a plane from which a rim is of roof and ground.
     """
     result, found = np.full((3, *height.shape), np.nan), np.empty((32, 2), np.int64)
-    z, x, y = np.empty(32), np.empty(32), np.empty(32)
+    z, x, y, down, up = np.empty((5, 32))
     for i in range(height.shape[0]):
         for j in range(height.shape[1]):
             count, behind = _rim(height, i, j, reach, found) if voids[i, j] else (0, 0)
@@ -96,25 +93,14 @@ def filled(height, lower, upper, voids, reach, apart):
             for k in range(count + behind):
                 row, column = found[k if k < count else count - k - 1]
                 z[k], x[k], y[k] = height[row, column], column - j, row - i
-            low = next_low = 0  # the lowest of the rim, and the next
-            for k in range(1, count):
-                if k == 1 or z[k] < z[next_low]:
-                    next_low = k
-                if z[next_low] < z[low]:
-                    low, next_low = next_low, low
-            middle, away = _plane(z[: count + behind], x, y)
-            is_smooth = away <= apart
-            value = middle if is_smooth else z[next_low]
-            below = above = below_low = above_low = 0.0  # means over the rim, and over its two lowest
-            for k in range(count):
-                row, column = found[k]
-                share = 0.5 * (k in (low, next_low))
-                below += (z[k] - lower[row, column]) / count
-                above += (upper[row, column] - z[k]) / count
-                below_low += share * (z[k] - lower[row, column])
-                above_low += share * (upper[row, column] - z[k])
-            below, above = max(below, below_low), max(above, above_low)
-            top = 0.0 if is_smooth else _SHARE * (z[:count].max() - value)
-            result[0, i, j], result[1, i, j] = value, value - below
-            result[2, i, j] = value + (top if top > above else above)
+                down[k], up[k] = z[k] - lower[row, column], upper[row, column] - z[k]
+            low, other = np.argsort(z[:count], kind="mergesort")[:2]
+            known = count + behind
+            middle, away = _plane(z[:known], x[:known], y[:known])
+            value = middle if away <= apart else z[other]
+            top = value if away <= apart else value + _SHARE * (z[:count].max() - value)
+            above = value + _larger(up[:count].mean(), (up[low] + up[other]) / 2)
+            result[0, i, j] = value
+            result[1, i, j] = value - _larger(down[:count].mean(), (down[low] + down[other]) / 2)
+            result[2, i, j] = _larger(above, top)
     return result

@@ -79,9 +79,20 @@ def every_nth(count: int) -> slice:
     return slice(None, None, max(1, math.ceil(count / POINTS)))
 
 
+def part_of(surface: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return a surface, and columns, rows and heights of points on it, for `put_together`.
+
+    The points are known heights of a block, ``(rows, columns)``; the surface has as many cells more on all sides.
+    """
+    row, column = np.nonzero(np.isfinite(height))
+    chosen = every_nth(row.size)
+    row, column, margin = row[chosen], column[chosen], (surface.shape[0] - height.shape[0]) / 2
+    return surface, column + margin, row + margin, height[row, column]
+
+
 def put_together(parts: Sequence[tuple[np.ndarray, ...]], cell: float, moves: int) -> Blocks | None:
     """Make blocks of surfaces, each with x, y and height of its points; None if no height of a surface is known."""
-    parts = [part for part in parts if np.isfinite(part[0]).any()]
+    parts = [part for part in parts if part[1].size and np.isfinite(part[0]).any()]
     if not parts:
         return None
     surfaces = [part[0] for part in parts]

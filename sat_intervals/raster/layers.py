@@ -2,7 +2,7 @@
 
 import logging
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from rasterio import Env
 from rasterio.crs import CRS
-from rasterio.io import MemoryFile
+from rasterio.io import DatasetWriter, MemoryFile
 from rasterio.shutil import copy
 from rasterio.transform import Affine
 from rasterio.windows import Window as RasterioWindow
@@ -54,13 +54,15 @@ def write_layer(
         temporary.write_bytes(memory.getbuffer())
 
 
-def png_of(pixels: np.ndarray) -> bytes:
-    """Return a picture: ``(bands, rows, columns)`` uint8, grey or colours, and opacity."""
+def png_of(pixels: np.ndarray, describe: Callable[[DatasetWriter], None] = lambda dataset: None) -> bytes:
+    """Return a picture: ``(bands, rows, columns)``, grey or colours, and opacity; ``describe`` adds what is not one."""
     count, height, width = pixels.shape
+    kind = {"count": count, "height": height, "width": width, "dtype": pixels.dtype.name}
     with Env(GDAL_PAM_ENABLED="NO"), MemoryFile() as plain, MemoryFile() as made:
-        with gdal.create(plain.name, count=count, height=height, width=width, dtype="uint8") as dataset:
+        with gdal.create(plain.name, **kind) as dataset:
             dataset.write(pixels)
-        copy(plain.name, made.name, driver="PNG")
+            describe(dataset)
+        copy(plain.name, made.name, driver="PNG", WRITE_METADATA_AS_TEXT="YES")
         return bytes(made.getbuffer())
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from operator import itemgetter
 from pathlib import Path
 from threading import Lock
@@ -33,28 +34,16 @@ def outlines(labels: np.ndarray, place: Georeferencing) -> list[Polygon]:
 
 @dataclass(frozen=True)
 class Areas:
-    """Polygons of a file on a map, and their extents there, ``(n, 4)``: left, bottom, right, top."""
+    """Polygons of a file on a map."""
 
     path: Path
     crs: str
     polygons: Sequence[Polygon]
-    extents: np.ndarray
 
-    @classmethod
-    def of(cls, path: Path, crs: str, polygons: Sequence[Polygon]) -> "Areas":
-        """Return the areas of polygons in a CRS."""
-        extents = np.array([bounds(one) for one in polygons]).reshape(-1, 4)
-        return cls(path, crs, polygons, extents)
-
-    @classmethod
-    def of_raster(cls, path: Path) -> "Areas":
-        """Return the areas of a raster that is not 0 inside: cells that touch along rows or columns are one."""
-        _, place = read_place(path)
-        with opened(str(path)) as dataset:
-            values = dataset.read(1)
-            inside = (dataset.read_masks(1) != 0) & (values != 0) & ~np.isnan(values)
-        assert place.crs is not None
-        return cls.of(path, place.crs.to_wkt(), outlines(inside.astype(np.int32), place))
+    @cached_property
+    def _extents(self) -> np.ndarray:
+        """Return left, bottom, right and top of each polygon: ``(n, 4)``."""
+        return np.array([bounds(one) for one in self.polygons]).reshape(-1, 4)
 
     def on(self, place: Georeferencing, shape: tuple[int, int]) -> "Areas":
         """Return the areas that are on a surface, on its map."""
@@ -62,15 +51,25 @@ class Areas:
         crs, extent = place.crs.to_wkt(), array_bounds(*shape, place.affine)
         try:  # those of other places may be on no map of this one
             near = [self.polygons[one] for one in self.near(transform_bounds(crs, self.crs, *extent))]
-            return Areas.of(self.path, crs, transform_geom(self.crs, crs, near) if near else [])
+            return Areas(self.path, crs, transform_geom(self.crs, crs, near) if near else [])
         except gdal.GDAL_ERRORS as error:
             raise SatIntervalsError(f"{self.path} is not on the map of the surface: {gdal.reason(error)}") from error
 
     def near(self, extent: tuple[float, float, float, float]) -> list[int]:
         """Return the indices of the areas whose extents meet one: left, bottom, right, top."""
         left, bottom, right, top = extent
-        wests, souths, easts, norths = self.extents.T
+        wests, souths, easts, norths = self._extents.T
         return np.flatnonzero((wests < right) & (left < easts) & (souths < top) & (bottom < norths)).tolist()
+
+
+def areas_of_raster(path: Path) -> Areas:
+    """Return the areas of a raster that is not 0 inside: cells that touch along rows or columns are one."""
+    _, place = read_place(path)
+    assert place.crs is not None
+    with opened(str(path)) as dataset:
+        values = dataset.read(1)
+        inside = (dataset.read_masks(1) != 0) & (values != 0) & ~np.isnan(values)
+    return Areas(path, place.crs.to_wkt(), outlines(inside.astype(np.int32), place))
 
 
 def numbers_of(areas: Areas | None, place: Georeferencing, window: Window) -> np.ndarray:

@@ -3,18 +3,17 @@
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Self
 
 import numpy as np
-from rasterio import Env
-from rasterio.io import MemoryFile
-from rasterio.shutil import copy
+from rasterio.io import DatasetWriter
 
-from sat_intervals.raster import gdal
 from sat_intervals.raster.cog import CopyParts, Part, assemble, template
 from sat_intervals.raster.files import File
 from sat_intervals.raster.georeferencing import Georeferencing
+from sat_intervals.raster.layers import png_of
 from sat_intervals.raster.publishing import Unfinished, check_space, failing, file_bytes, unfinished
 from sat_intervals.raster.streaming import Stream
 from sat_intervals.store.remote import disk_of, path_of
@@ -94,21 +93,16 @@ class OutputWriter:
         for name, file in self._unfinished.items():
             with failing(file.path):
                 if name in self._pictures:
-                    file.temporary.write_bytes(self._drawn(name))
+                    bands = np.concatenate(self._pictures[name], axis=1)
+                    file.temporary.write_bytes(png_of(bands, partial(self._describe, self._files[name])))
                 file.flush()
         return {name: file.temporary for name, file in self._unfinished.items()}
 
-    def _drawn(self, name: str) -> bytes:
-        """Return the content of a picture."""
-        file, bands = self._files[name], np.concatenate(self._pictures[name], axis=1)
-        kind = {"count": len(file.bands), "dtype": file.dtype, "nodata": file.nodata}
-        with Env(GDAL_PAM_ENABLED="NO"), MemoryFile() as plain, MemoryFile() as made:
-            with gdal.create(plain.name, height=bands.shape[1], width=bands.shape[2], **kind) as dataset:
-                dataset.write(bands)
-                dataset.update_tags(**self._tags)
-                file.describe(dataset)
-            copy(plain.name, made.name, driver="PNG", WRITE_METADATA_AS_TEXT="YES")
-            return bytes(made.getbuffer())
+    def _describe(self, file: File, dataset: DatasetWriter) -> None:
+        """Add tags, no data and descriptions to a picture."""
+        dataset.nodata = file.nodata
+        dataset.update_tags(**self._tags)
+        file.describe(dataset)
 
     def publish(self) -> None:
         """Finish all files and give them their names, in the order in which the files were given."""

@@ -58,7 +58,7 @@ def assemble(job: Job, workers: Workers, seconds: dict[str, float], progress: Pr
             made, completed = writer.build(), None
             if job.swept and job.swept.completion:
                 surface = made[files[0].name]
-                completed = complete(surface, files[0], place, tags_of(job), job.swept.completion, progress)
+                completed = complete(surface, surface, files[0], job.swept.completion, progress)
         with logged_stage(seconds, "inputs"):
             check_unchanged(absolute_in(job.out, job.inputs), job.images, job.config)
         report = report_of(job, tables, scale, parts.values(), seconds)

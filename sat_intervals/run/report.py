@@ -48,7 +48,6 @@ def tags_of(job: Job) -> dict[str, str]:
 def _tags_of_surface(job: Job, swept: Swept) -> dict[str, str]:
     """Return the tags of the surface of a sweep, see `surface_tags`; the size of tiles is not in them."""
     software = {"SOFTWARE": f"sat-intervals {version('sat-intervals')}"}
-    software |= swept.completion.tags() if swept.completion else {}
     tags = {"RUNS": swept.asked, "HEIGHTS": f"above {swept.level}"} | tags_of_sweep(job.config, len(job.images))
     cell = job.left.georeferencing.affine.a
     return software | (swept.calibration.tagged(tags, cell) if swept.calibration else tags)

@@ -21,7 +21,7 @@ def draw_change(change: Path, report: dict[str, Any], target: Path, dpi: int = c
     inches = canvas.map_size(shape, _LONGEST)
     difference, *_, kind = read_small_layers(change, canvas.fitting(shape, inches, dpi))
     frame, changed = canvas.PlotFrame.on_map(place, shape), np.where(np.abs(kind) == 1, difference, np.nan)
-    end = min(widest(np.abs(changed), _CUT), _TIMES * widest(np.abs(changed), 50))  # small changes keep their colours
+    end = widest(np.abs(changed), _CUT, _TIMES)  # small changes keep their colours
     (gained, of_gained), (lost, of_lost) = (report["volume"][name] for name in ("gained", "lost"))
     caption = (
         f"{report['before']} to {report['after']}\nfalse alarms {100 * report['rate']['named']:g} %, areas of "

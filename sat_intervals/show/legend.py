@@ -65,7 +65,8 @@ def limits(values: np.ndarray, otherwise: tuple[float, float] = (0, 1), cut: flo
     return (low, high) if low < high else (low - 0.5, high + 0.5)
 
 
-def widest(widths: np.ndarray, cut: float) -> float:
-    """Return the finite width that ``cut`` percent exceed; 1 if it is zero or there are none."""
+def widest(widths: np.ndarray, cut: float, times: float = np.inf) -> float:
+    """Return the finite width that ``cut`` percent exceed, at most so many medians; 1 if it is zero or without any."""
     known = widths[np.isfinite(widths)]
-    return float(np.percentile(known, 100 - cut, method="nearest") or 1.0) if known.size else 1.0
+    most, middle = np.percentile(known, (100 - cut, 50), method="nearest") if known.size else (1.0, 1.0)
+    return float(min(most, times * middle) or 1.0)

@@ -8,7 +8,7 @@ import numpy as np
 from sat_intervals.products import SURFACE
 from sat_intervals.raster import read_small_layers, read_tags, surface_place
 from sat_intervals.show import canvas
-from sat_intervals.show.legend import limits
+from sat_intervals.show.legend import limits, widest
 from sat_intervals.show.relief import relief
 
 _LONGEST = 11.0  # inches of the longer side of the hillshade, of which titles and labels take a part
@@ -16,9 +16,9 @@ _SHOWN = 10.0  # inches of it at least
 _SMALL = 2.8  # times that other maps are smaller
 _WIDE = 1.4  # ratio of the sides of a surface from which they are below the hillshade, not beside it
 _MOST_CELLS = 2000  # along a side, that have a pixel each
-# Percentile of half widths at the end of their scale, which is at most so many times their median: a strip of wide
+# Percent of half widths beyond the end of their scale, which is at most so many times their median: a strip of wide
 # intervals then leaves the others their colours.
-_MOST, _TIMES = 98, 12
+_MOST, _TIMES = 2, 12
 
 
 def draw_surface(surface: Path, target: Path, dpi: int = canvas.DPI) -> None:
@@ -31,13 +31,17 @@ def draw_surface(surface: Path, target: Path, dpi: int = canvas.DPI) -> None:
     halves = (bands["height_upper"] - bands["height_lower"]) / 2
     across, down = place.pixel_size[0] * shape[1] / drawn[1], place.pixel_size[1] * shape[0] / drawn[0]
     frame = canvas.PlotFrame.on_map(place, shape)
-    middle, end = _middle_and_end(halves)
+    end, made = widest(halves, _MOST, _TIMES), bands["count"] == 0
     layers = _layers(height, halves, bands, end)
     step = "" if drawn == shape else f", {drawn[0]} x {drawn[1]} of them drawn"
-    filled = f"{100 * np.isfinite(height).mean():.1f} % filled"
+    shares = f"{100 * np.isfinite(height).mean():.1f} % with a height"
+    shares += (
+        f", of these {100 * made.sum() / np.isfinite(height).sum():.1f} % filled or flattened" if made.any() else ""
+    )
+    middle = f", median +-{np.nanmedian(halves):.2f} m" if np.isfinite(halves).any() else ""
     code = place.crs.to_epsg()
     caption = (
-        f"{surface.name}: {shape[0]} x {shape[1]} cells of {place.pixel_size[0]:g} m{step}, {filled}{middle}\n"
+        f"{surface.name}: {shape[0]} x {shape[1]} cells of {place.pixel_size[0]:g} m{step}, {shares}{middle}\n"
         f"{f'EPSG:{code}' if code else place.crs.to_string()[:60]}, heights {read_tags(surface).get('HEIGHTS', '')}"
     )
     size, arranged = _arrangement(shape)
@@ -82,12 +86,3 @@ def _arrangement(shape: tuple[int, int]) -> tuple[tuple[float, float], dict[str,
     rows = [["shade", name] for name in ("height", "half", "last")]
     small = wide / _SMALL + 2.6  # with its colour bar
     return (wide + small + 1.3, tall + 1.2), {"mosaic": rows, "width_ratios": (wide + 0.9, small)}
-
-
-def _middle_and_end(halves: np.ndarray) -> tuple[str, float]:
-    """Return the median of half widths for the caption, and the end of their scale in metres; 1 without any."""
-    known = halves[np.isfinite(halves)]
-    if not known.size:
-        return "", 1.0
-    middle, most = np.percentile(known, (50, _MOST))
-    return f", median +-{middle:.2f} m", float(min(most, _TIMES * middle)) or 1.0

@@ -34,7 +34,7 @@ from sat_intervals.run.status import read_report
 from sat_intervals.run.workers import Workers
 from sat_intervals.store.lock import locked
 from sat_intervals.tiling import Window
-from sat_intervals.workflows.many import FIGURES, Wanted, asked_of, complete_sweep, sweep_job
+from sat_intervals.workflows.many import FIGURES, Wanted, asked_of, complete_sweep, sweep_job, write_ortho
 from sat_intervals.workflows.surface import FILES, Rectified, check_cells, epipolar_pair, has_grids, surface_of
 
 _LOG = logging.getLogger(__name__)
@@ -154,7 +154,7 @@ class _Surfaces:
                 if not pair.more:
                     check_cells(_cells(pair), replace(_choices(pair), calibration=None), None)
                 if has_grids(pair.sensors):
-                    check_sensors(pair.sensors or (), _cells(pair)["resolution"], pair.options.get("crs"))
+                    check_sensors(pair.sensors or (), pair.resolution or 0.0, pair.options.get("crs"))
             except SatIntervalsError as error:
                 self._errors[pair.name] = error
                 _LOG.warning("%s: there will be no surface: %s", pair.name, error)
@@ -167,14 +167,13 @@ class _Surfaces:
                 check_cells(_cells(pair), choices, resolved(settings).interval)
             images, how = self._epipolar(pair, out), {"overwrite": overwrite, "pair": pair.name, "each": each}
             return open_job(*images, out, settings, window=_window(pair), **how)
-        options: dict[str, Any] = {**pair.options}  # those of pairs are not there
-        options.pop("height_calibration", None)
-        wanted = Wanted(pair.resolution or 0.0, **options, calibration=_choices(pair).calibration)
+        options: dict[str, Any] = {name: pair.options.get(name) for name in ("crs", "geoid", "extent", "heights")}
+        wanted = Wanted(pair.resolution or 0.0, **options, choices=_choices(pair))
         asked = asked_of(_opened(pair), out, settings, wanted, overwrite=overwrite)
         if not overwrite and complete_sweep(asked, out, keep_tiles=keep_tiles):
             return None
         job = sweep_job(asked, out, each, overwrite=overwrite, pair=pair.name)
-        if wanted.ortho:
+        if wanted.choices.ortho:
             self._orthos[pair.name] = job
         return job
 
@@ -203,8 +202,6 @@ class _Surfaces:
                 cells = _cells(pair) | {"choices": _choices(pair)}
                 return {"surface": surface_of(out, self._sensors[pair.name], progress, **cells)}
             if pair.name in self._orthos:
-                from sat_intervals.workflows.ortho import write_ortho
-
                 write_ortho(self._orthos[pair.name], progress)
             return {}
         except Exception as error:  # one pair's failure must not stop the others

@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sat_intervals.config import Config, HeightCalibration, Sweep, resolved, surface_key
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.heights.choices import SurfaceChoices, completion_of
 from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.match.ground import GroundViews
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.prepare.pair import Each, FilePair
 from sat_intervals.prepare.prepared import Prepared
-from sat_intervals.products import ORTHO, plain
+from sat_intervals.products import ORTHO, Band, plain
 from sat_intervals.progress import Progress, logged_stage
 from sat_intervals.raster import Image, Projection, find_model, north_up, utm_of
 from sat_intervals.raster.completion import Completion
@@ -57,11 +58,7 @@ class Wanted(NamedTuple):
     extent: tuple[float, float, float, float] | None = None
     heights: tuple[float, float] | None = None
     models: Sequence[str | Path | None] = ()
-    ortho: bool = False
-    calibration: HeightCalibration | None = None
-    fill: float | None = None
-    flatten: Path | None = None
-    mask: Path | None = None
+    choices: SurfaceChoices = SurfaceChoices()
 
 
 @dataclass(frozen=True)
@@ -80,7 +77,7 @@ class Asked:
     @property
     def request(self) -> str:
         """Return a digest of all that is asked for."""
-        calibration = self.wanted.calibration and self.wanted.calibration.sha256
+        calibration = self.wanted.choices.calibration and self.wanted.choices.calibration.sha256
         settings = self.config.model_dump(mode="json", exclude={"cluster", "preset"})
         return digest([self.digest, settings, calibration, self.completion and self.completion.key])
 
@@ -109,17 +106,24 @@ def surface_of_many(
             job = sweep_job(asked, out, EachOnWorkers(connection, progress), overwrite=overwrite)
         with locked(out):
             report = complete_before(job) if not job.begin() else match_and_assemble(job, connection, seconds, progress)
-            if wanted.ortho:
-                from sat_intervals.workflows.ortho import write_ortho
-
+            if wanted.choices.ortho:
                 write_ortho(job, progress)
             end_tiles(job, keep_tiles=keep_tiles)
     return report
 
 
+def write_ortho(job: Job, progress: Progress) -> None:
+    """Write the median of all images, resampled to the surface of a finished run; an existing file is replaced."""
+    from sat_intervals.heights.ortho import write_orthos
+
+    surface, ground = job.out / "dsm.tif", job.prepared.ground
+    assert ground
+    meaning = "median of the images that see the cell, resampled to the surface; no data without a height"
+    write_orthos(surface, [*job.images.values()], ground, [Band("grey level", "", meaning)], progress)
+
+
 def asked_of(images: Sequence[Image], out: Path, config: Config, wanted: Wanted, *, overwrite: bool = False) -> Asked:
     """Check all that can be checked before the geometry of a sweep is found."""
-    from sat_intervals.heights.choices import completion_of
     from sat_intervals.heights.dsm import checked_cells
 
     config = resolved(config)
@@ -131,17 +135,17 @@ def asked_of(images: Sequence[Image], out: Path, config: Config, wanted: Wanted,
     grid, cell, crs, _ = checked_cells(wanted.resolution, wanted.crs, None, wanted.geoid)
     if wanted.extent:
         grid = _cells_of(wanted.extent, grid, cell)
-    completion = completion_of(cell, wanted.fill, wanted.flatten, wanted.mask)
-    _check_margins(wanted.calibration, config, len(images), cell)
+    choices, completion = wanted.choices, completion_of(cell, wanted.choices)
+    _check_margins(choices.calibration, config, len(images), cell)
     check_folder(out, overwrite=overwrite, names=outputs_of(config))
     named = {f"image_{number}": image for number, image in enumerate(images, start=1)}
     inputs = describe_inputs(named, config, {})
-    outputs = [*outputs_of(config), *([ORTHO] if wanted.ortho else [])]
+    outputs = [*outputs_of(config), *([ORTHO] if choices.ortho else [])]
     found = (model for one in images if (model := find_model(one.path)) != one.path)
     files = wanted.geoid, *(wanted.models or found)
-    like = [wanted.flatten, wanted.mask, wanted.resolution if isinstance(wanted.resolution, Path) else None]
+    like = [choices.flatten, choices.mask, wanted.resolution if isinstance(wanted.resolution, Path) else None]
     check_not_replaced([*identities(inputs), *files, *like], [out / name for name in outputs], [home_of(out)])
-    if wanted.ortho and read_report(out) is None:
+    if choices.ortho and read_report(out) is None:
         check_free(out / ORTHO, overwrite=overwrite)
     decisive = {
         "made_by": [version("sat-intervals"), FINGERPRINT],
@@ -199,7 +203,7 @@ def complete_sweep(asked: Asked, out: Path, *, keep_tiles: bool) -> dict[str, An
         return None
     if before.get("sweep", {}).get("request") != asked.request:
         raise SatIntervalsError(f"{out} holds another run: give another folder, or --overwrite (overwrite=True)")
-    if asked.wanted.ortho and not (out / ORTHO).exists():
+    if asked.wanted.choices.ortho and not (out / ORTHO).exists():
         return None
     with locked(out):
         open_run(out)  # its files are there
@@ -265,13 +269,13 @@ def geometry_job(asked: Asked, out: Path, geometry: Geometry, region: Window | N
     """Make the job of a sweep whose geometry is known: its left image is the grid of cells."""
     (ground, figures), cells = geometry, geometry[1]["cells"]
     place = north_up(figures["crs"], cells["left"], cells["top"], cells["resolution"])
-    _check_margins(asked.wanted.calibration, asked.config, len(figures["used"]), cells["resolution"])
+    _check_margins(asked.wanted.choices.calibration, asked.config, len(figures["used"]), cells["resolution"])
     swept = Swept(
         {name: asked.images[name] for name in figures["used"]},
         asked.digest,
         str(asked.wanted.geoid or "the WGS 84 ellipsoid"),
         figures | {"request": asked.request},
-        asked.wanted.calibration,
+        asked.wanted.choices.calibration,
         asked.completion and asked.completion.on(place, (cells["rows"], cells["columns"])),
     )
     config = with_range(asked.config, figures)

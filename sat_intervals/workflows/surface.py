@@ -49,7 +49,6 @@ def surface(
     choices: SurfaceChoices | None = None,
     extent: tuple[float, float, float, float] | None = None,
     heights: tuple[float, float] | None = None,
-    ortho: bool = False,
     sensors: Sequence[str | Path | None] = (),
     dem: str | Path | None = None,
     altitude: float | None = None,
@@ -82,8 +81,8 @@ def surface(
         RPC models of the images; of an epipolar pair left and right model and grid, see `set_geometry`. By default the
         models that belong to raw images, and what `rectify` has noted of its pair.
     radius, choices
-        Of two images, as for `make_surface`; of more, ``choices`` may have ``calibration``, ``fill``, ``flatten`` and
-        ``mask``.
+        Of two images, as for `make_surface`; of more, ``choices`` may have ``calibration``, ``ortho``, ``fill``,
+        ``flatten`` and ``mask``.
     dem, altitude, resolution_of
         Of two raw images, as for `rectify`; the heights of ``dem`` refer to ``geoid``.
     window
@@ -94,8 +93,6 @@ def surface(
     heights
         Of three images or more: lowest and highest height of the ground, metres above ``geoid`` or the ellipsoid; by
         default found.
-    ortho
-        Whether to write ``out/ortho.tif``: the left raw image, or the median of more, resampled to the surface.
     progress
         Callback, see `Progress`.
     on_rectified
@@ -118,21 +115,19 @@ def surface(
     config, out, geoid = load_config(config, images=len(opened)), path_of(out), path_of(geoid) if geoid else None
     resolution = path_of(resolution) if isinstance(resolution, str) else resolution
     choices, raw = choices or SurfaceChoices(), {"dem": dem, "altitude": altitude, "resolution_of": resolution_of}
-    of_many = choices.calibration, choices.fill, choices.flatten, choices.mask
-    of_points = replace(choices, calibration=None, fill=None, flatten=None, mask=None) != SurfaceChoices()
+    of_points = replace(choices, calibration=None, ortho=False, fill=None, flatten=None, mask=None) != SurfaceChoices()
     if len(opened) < 2:
         raise SatIntervalsError(f"images: {len(opened)} given, a surface needs two or more")
     how: dict[str, Any] = {"overwrite": overwrite, "progress": progress}
     if len(opened) > 2:
         check_absent(raw | {"window": window, "radius": radius, "a choice of points": of_points or None}, "two images")
-        wanted = Wanted(resolution, crs, geoid, extent, heights, sensors, ortho, *of_many)
+        wanted = Wanted(resolution, crs, geoid, extent, heights, sensors, choices)
         return surface_of_many(opened, out, config, wanted, keep_tiles=keep_tiles, **how)
     check_absent({"extent": extent, "heights": heights}, "three images or more")
     check_cost(config)
     cells = {"resolution": resolution, "crs": crs, "radius": radius, "geoid": geoid}
     check_cells(cells, choices, resolved(config).interval)
     pair = epipolar_pair(opened, out, sensors, window, on_rectified, geoid=geoid if dem else None, **raw, **how)
-    choices = replace(choices, ortho=ortho or choices.ortho)
     if choices.ortho:
         raw_inputs(pair.left.path, pair.right.path)
     grid = files_of(str(resolution)) if isinstance(resolution, Path) else ()
@@ -151,7 +146,7 @@ def surface(
 def check_cells(cells: Mapping[str, Any], choices: SurfaceChoices, interval: Interval | None) -> None:
     """Raise for cells that the surface cannot have, before hours of matching."""
     _, cell, _, radius = checked_cells(**cells)
-    completion_of(cell, choices.fill, choices.flatten, choices.mask)
+    completion_of(cell, choices)
     surface_tags(["run"], [interval], choices.for_intervals([interval]), cell, radius)
 
 

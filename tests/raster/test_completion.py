@@ -10,7 +10,7 @@ from numpy.testing import assert_array_equal
 from surfaces import PLACE, write_raster, write_surface
 
 from sat_intervals import SatIntervalsError
-from sat_intervals.heights.choices import completion_of
+from sat_intervals.heights.choices import SurfaceChoices, completion_of
 from sat_intervals.products import SURFACE
 from sat_intervals.raster import completion, read_layers, read_place, surface_file
 
@@ -45,8 +45,8 @@ def completed(scene, **options):
     path, _ = scene
     there = shutil.copy(path, path.with_name("dsm.tif"))
     shape, place = read_place(there)
-    how = completion_of(1.0, options.get("fill"), options.get("flatten"), options.get("mask")).on(place, shape)
-    report = completion.complete(there, surface_file("dsm.tif"), place, how.tags(), how, lambda *_: None)
+    how = completion_of(1.0, SurfaceChoices(**options)).on(place, shape)
+    report = completion.complete(there, there, surface_file("dsm.tif"), how, lambda *_: None)
     return read_layers(there), report
 
 

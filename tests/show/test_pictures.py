@@ -316,6 +316,9 @@ def test_relief__is_bright_where_it_faces_the_sun():
     assert np.allclose(flat, np.sqrt(0.5))
     assert (north_west > flat[0, 0]).all()
     assert (south_east < flat[0, 0]).all()
+    pyramid[2, 2] = np.nan
+    with_hole = relief(pyramid, 1.0, 1.0)
+    assert (np.isnan(with_hole) == np.isnan(pyramid)).all()  # cells beside it have a shade
 
 
 def test_draw_curve__tells_of_what_lies_outside_and_shows_what_has_no_width(run, tmp_path, words):
