@@ -103,7 +103,9 @@ def cell_options(command: options.Command) -> options.Command:
         choices["fill"] = _FILL_DISTANCE if fills and distance is None else distance
         calibration = given.pop("height_calibration")
         cells = {name: given.pop(name) for name in ("resolution", "crs", "radius", "geoid")}
-        cells["resolution"] = side_of(cells["resolution"], given.pop("grid_like"))
+        grid_like = given.pop("grid_like")
+        if cells["resolution"] or grid_like:  # a surface that is only completed has its own
+            cells["resolution"] = side_of(cells["resolution"], grid_like)
         from sat_intervals.config import load_height_calibration
         from sat_intervals.heights.choices import SurfaceChoices
 
@@ -198,13 +200,15 @@ def dsm(
     unless --geoid is given. A point contributes to its cell and to cells whose centre is within --radius. Other cells
     are no data.
 
-    --fill fills voids inside the surface, --flatten gives areas such as lakes one height: count is 0 there.
+    --fill fills voids inside the surface, --flatten gives areas such as lakes one height: count is 0 there. A finished
+    surface of three images and more is completed without matching again: dsm OUT --fill --output FILE.
 
     Several OUT are moved onto each other first: models of their images differ by a pixel or so. Where they overlap,
     heights and intervals are averaged, narrow ones with the most weight. Heights more than two cells apart are not:
     the one with a third of the weights below it is taken. Where intervals do not meet, agreement is 0, and it is their
     hull.
     """
+    from sat_intervals.cli.console import say_completed
     from sat_intervals.heights.dsm import make_surface
     from sat_intervals.raster.publishing import check_free
     from sat_intervals.run.status import runs_of
@@ -218,7 +222,10 @@ def dsm(
         options.note_geometry(outs, sensor_files)
         report = make_surface(outs, output, **(cells | {"choices": choices}), progress=console.progress)
     printing.say(report)
-    say_surface(console, report)
+    if "geometry" in report:
+        say_surface(console, report)
+    else:
+        say_completed(console, report["completed"])
     console.say(str(output))
     if choices.ortho:
         console.say(str(output.with_name("ortho.tif")))

@@ -2,13 +2,14 @@
 
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sat_intervals.config import Calibration, Interval
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import SatIntervalsError, check_absent
 from sat_intervals.heights.alignment import aligned
 from sat_intervals.heights.cells import CellCounts, Strip, strips
 from sat_intervals.heights.choices import SurfaceChoices, completion_of
@@ -20,7 +21,17 @@ from sat_intervals.heights.rectify import raw_inputs
 from sat_intervals.machine import usable_cores
 from sat_intervals.products import ORTHO
 from sat_intervals.progress import Progress
-from sat_intervals.raster import OutputWriter, Projection, files_of, north_up, path_of, read_place, surface_file, utm_of
+from sat_intervals.raster import (
+    OutputWriter,
+    Projection,
+    files_of,
+    north_up,
+    path_of,
+    read_place,
+    run_files,
+    surface_file,
+    utm_of,
+)
 from sat_intervals.raster.completion import Completion, complete
 from sat_intervals.raster.georeferencing import horizontal_name
 from sat_intervals.raster.heightfield import warn_of_no_data
@@ -38,24 +49,26 @@ def make_surface(
     outs: Sequence[str | Path | Run],
     path: str | Path,
     *,
-    resolution: float | Path,
+    resolution: float | Path | None = None,
     crs: str | None = None,
     radius: float | None = None,
     geoid: str | Path | None = None,
     choices: SurfaceChoices | None = None,
     progress: Progress = lambda stage, done, total: None,
 ) -> dict[str, Any]:
-    """Make a surface model from one or several runs.
+    """Make a surface model from one or several runs, or complete that of a run of many images.
 
     Parameters
     ----------
     outs
         Folders of finished runs of the same place, or runs as they were opened; `set_geometry` has named models and
-        grids of each.
+        grids of each. Or a run of three images or more alone: its surface is completed by ``choices``, which have
+        ``fill``, ``flatten`` or ``mask``.
     path
         The Cloud-Optimized GeoTIFF to write; an existing file is replaced.
     resolution
-        Side of a cell in metres; or a north-up raster with square pixels, whose grid and CRS are used.
+        Side of a cell in metres; or a north-up raster with square pixels, whose grid and CRS are used. None of many
+        images: their surface keeps its grid.
     crs
         A projected CRS in metres; by default the UTM zone of a point near the middle, or that of the raster.
     radius
@@ -79,7 +92,7 @@ def make_surface(
     ``completed``, numbers of cells ``filled``, ``flattened``, ``masked``, and ``voids`` that stay, of ``areas`` of one
     height, and of those ``without_rim``, which are voids, None of a surface as it was measured; ``geometry``, for each
     folder, how models and grids fit, see `set_geometry`, and ``lost``, the share of the region where they have no
-    values.
+    values. Of many images only ``crs``, ``rows``, ``columns`` and ``completed``.
 
     Raises
     ------
@@ -88,20 +101,22 @@ def make_surface(
         the file cannot be written.
     """
     path, geoid, choices = path_of(path), None if geoid is None else path_of(geoid), choices or SurfaceChoices()
+    runs = [out if isinstance(out, Run) else open_run(out) for out in outs]
+    if len(runs) == 1 and runs[0].is_sweep:
+        check_absent({"resolution": resolution, "crs": crs, "radius": radius, "geoid": geoid}, "runs of two images")
+        return _completed(runs[0], path, choices, progress)
     given = [geoid, choices.flatten, choices.mask, *_files_of(choices.reference), *_files_of(resolution)]
     grid, resolution, crs, radius = checked_cells(resolution, crs, radius, geoid)
     completion = completion_of(resolution, choices)
     level = f"above {geoid or 'the WGS 84 ellipsoid'}"
     _check_reference(choices.reference, path, level)
-    geometries = _geometries(outs, [path, path.with_name(ORTHO)][: 1 + choices.ortho], given, progress)
-    runs = [geometry.run for geometry in geometries]
+    geometries = _geometries(runs, [path, path.with_name(ORTHO)][: 1 + choices.ortho], given, progress)
     intervals = [run.config.interval for run in runs]
     choices = choices.for_intervals(intervals)
     tags = surface_tags([run.report["finished"] for run in runs], intervals, choices, resolution, radius)
     tags["HEIGHTS"] = level
-    middle = geometries[0].lattice.middle
-    projection = Projection(crs or utm_of(*middle), geoid)
-    projection.check(*middle)
+    projection = Projection(crs or utm_of(*geometries[0].lattice.middle), geoid)
+    projection.check(*geometries[0].lattice.middle)
     clouds = [PointCloud(one.run, on_map(one.lattice, projection, str(one.run.out)), choices) for one in geometries]
     with ThreadPoolExecutor(usable_cores()) as threads:
         cells, shifts = _cells(threads, clouds, resolution, radius, grid), list[dict[str, Any]]()
@@ -119,6 +134,20 @@ def make_surface(
         "without_intervals": [str(run.out) for run in runs if run.config.interval is None],
         "geometry": {str(one.run.out): one.report for one in geometries},
     }
+
+
+def _completed(run: Run, path: Path, choices: SurfaceChoices, progress: Progress) -> dict[str, Any]:
+    """Write the surface of a run of many images, completed; return its grid, and the numbers of `complete`."""
+    measured = run.out / "dsm.tif"
+    (rows, columns), place = read_place(measured)
+    completion = completion_of(place.pixel_size[0], choices)
+    if completion is None or replace(choices, fill=None, flatten=None, mask=None) != SurfaceChoices():
+        raise SatIntervalsError(f"{run.out} has the surface of many images: give fill, flatten or mask, and no more")
+    run.check_kept([path], [measured, choices.flatten, choices.mask])
+    file, _ = run_files(run.config.products.compression, of_heights=True)
+    completed = complete(measured, path, file, completion.on(place, (rows, columns)), progress)
+    assert place.crs is not None
+    return {"crs": horizontal_name(place.crs), "rows": rows, "columns": columns, "completed": completed}
 
 
 def _check_reference(reference: Path | None, surface: Path, level: str) -> None:
@@ -162,13 +191,12 @@ def _write(
 
 
 def _geometries(
-    outs: Sequence[str | Path | Run], written: Sequence[Path], given: Iterable[str | Path | None], progress: Progress
+    runs: Sequence[Run], written: Sequence[Path], given: Iterable[str | Path | None], progress: Progress
 ) -> list[Geometry]:
     """Return the geometry of each run; raise if one is given twice, or its files or given ones would be replaced.
 
     Of two files that are written, the second is an ortho-image of the raw image of the first run.
     """
-    runs = [out if isinstance(out, Run) else open_run(out) for out in outs]
     if len(written) > 1:
         pair = (runs[0].report["inputs"][side]["path"] for side in ("left", "right"))
         check_not_replaced(identities(raw_inputs(*pair)), written)
@@ -185,10 +213,12 @@ def _geometries(
 
 
 def checked_cells(
-    resolution: float | Path, crs: str | None, radius: float | None, geoid: Path | None = None
+    resolution: float | Path | None, crs: str | None, radius: float | None, geoid: Path | None = None
 ) -> tuple[Cells | None, float, str | None, float]:
     """Check the arguments of `make_surface` that need no run; return grid of a raster, resolution, CRS and radius."""
     grid = None
+    if resolution is None:
+        raise SatIntervalsError("no resolution: give the side of a cell, or a raster whose grid is taken")
     if isinstance(resolution, Path):
         grid, crs = _grid_of(resolution, crs)
         resolution = grid.resolution

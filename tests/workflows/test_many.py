@@ -97,6 +97,19 @@ def test_surface_of_many__is_completed_the_same_in_a_batch_and_knows_with_what(s
     (tmp_path / "rows.json").write_text(json.dumps([row | {"fill": 20, "mask": "mask.tif"}]))
     assert invoke("batch", tmp_path / "rows.json", tmp_path / "batch").exit_code == 0
     assert files_of(tmp_path / "batch" / "out") == files_of(tmp_path / "out")
+    # without matching again
+    later = "dsm", sweep.out, "--fill", "--mask", tmp_path / "mask.tif", "--output"
+    result = invoke(*later, tmp_path / "later.tif")
+    assert result.exit_code == 0, result.output
+    assert f"cells filled from their rims: {filled.sum()}" in result.stdout
+    assert_array_equal(read_layers(tmp_path / "later.tif"), bands)
+    with rasterio.open(tmp_path / "later.tif") as one, rasterio.open(tmp_path / "out" / "dsm.tif") as other:
+        kinds = [(each.crs, each.transform, each.descriptions, each.compression) for each in (one, other)]
+        assert kinds[0] == kinds[1]
+        assert one.tags() == other.tags() | {"RUNS": one.tags()["RUNS"]}
+    refused(("dsm", sweep.out, "--output", tmp_path / "none.tif"), "give fill, flatten or mask, and no more")
+    refused((*later, tmp_path / "none.tif", "--resolution", 1), "resolution is for runs of two images")
+    refused((*later, sweep.out / "dsm.tif", "--overwrite"), "dsm.tif is an input")
 
 
 def test_surface_of_many__finds_the_heights_on_a_part_of_a_large_grid(sweep, tmp_path):
