@@ -14,7 +14,7 @@ from sat_intervals.heights.alignment import aligned
 from sat_intervals.heights.cells import CellCounts, Strip, strips
 from sat_intervals.heights.choices import SurfaceChoices, completion_of
 from sat_intervals.heights.geometry import FILE, Geometry, geometry_of
-from sat_intervals.heights.lattice import Ground, joined, on_map
+from sat_intervals.heights.lattice import Extent, Ground, joined, on_map
 from sat_intervals.heights.ortho import write_ortho_of
 from sat_intervals.heights.point_cloud import Cells, PointCloud
 from sat_intervals.heights.rectify import raw_inputs
@@ -235,18 +235,31 @@ def checked_cells(
     return grid, resolution, crs, radius
 
 
-def check_sensors(files: Sequence[str | Path], resolution: float | Path, crs: str | None) -> None:
-    """Raise before hours of matching if models or grids cannot be read, or pixels have too many cells."""
+def check_sensors(
+    files: Sequence[str | Path], resolution: float | Path, crs: str | None, choices: SurfaceChoices
+) -> None:
+    """Raise before hours of matching if models or grids cannot be read, or pixels have too many cells.
+
+    Check, too, that areas of the ``choices`` are on the map, and warn of those of other places.
+    """
     from sat_intervals.heights.sensors import Sensors, lattice_of
 
     sensors = Sensors.load(*map(path_of, files))
-    column, row = (int(nodes[nodes.size // 2]) for nodes in sensors.left_grid.points)
-    lattice = lattice_of(sensors, Window(row, column, 2, 2), 0, 1)
+    columns, rows = sensors.left_grid.points
+    lattice = lattice_of(sensors, Window(int(rows[rows.size // 2]), int(columns[columns.size // 2]), 2, 2), 0, 1)
     if isinstance(resolution, Path) or not np.isfinite(lattice.nodes).all():
         return
-    count = Ground(on_map(lattice, Projection(crs or utm_of(*lattice.middle)), "pair")).pixel_area / resolution**2
+    projection = Projection(crs or utm_of(*lattice.middle))
+    count = Ground(on_map(lattice, projection, "pair")).pixel_area / resolution**2
     if 2 * count > _CELLS_PER_PIXEL:  # the box around all cells may be twice as large as the image
         raise SatIntervalsError(f"{count:.0f} cells of {resolution:g} m for each pixel: choose a coarser resolution")
+    if completion := completion_of(resolution, choices):
+        ends = (nodes[[0, nodes.size // 2, -1]] for nodes in (rows, columns))
+        row, column = (axis.ravel() for axis in np.meshgrid(*ends))
+        points = sensors.triangulate(row, column, np.zeros(9))
+        x, y = projection.place(*points[np.isfinite(points).all(axis=1), :2].T)
+        cells = Cells.over(Extent(x.min(), y.min(), x.max(), y.max()), resolution)
+        completion.on(north_up(projection.crs, cells.left, cells.top, resolution), (cells.rows, cells.columns))
 
 
 def surface_tags(

@@ -154,7 +154,7 @@ class _Surfaces:
                 if not pair.more:
                     check_cells(_cells(pair), replace(_choices(pair), calibration=None), None)
                 if has_grids(pair.sensors):
-                    check_sensors(pair.sensors or (), pair.resolution or 0.0, pair.options.get("crs"))
+                    check_sensors(pair.sensors or (), pair.resolution or 0.0, pair.options.get("crs"), _choices(pair))
             except SatIntervalsError as error:
                 self._errors[pair.name] = error
                 _LOG.warning("%s: there will be no surface: %s", pair.name, error)
@@ -188,7 +188,7 @@ class _Surfaces:
         if pair.options.get("ortho"):
             raw_inputs(made.left.path, made.right.path)
         if not has_grids(sensors):
-            check_sensors(made.sensors, pair.resolution, pair.options.get("crs"))
+            check_sensors(made.sensors, pair.resolution, pair.options.get("crs"), _choices(pair))
         self._sensors[pair.name] = made.sensors
         return made.left, made.right
 

@@ -135,7 +135,7 @@ def surface(
     results = [out / name for name in (*OUTPUTS, *FILES)]
     read += map(str, filter(None, (*pair.sensors, geoid, choices.flatten, choices.mask, *grid)))
     check_not_replaced(read, results, [out / "tiles"])
-    check_sensors(pair.sensors, resolution, crs)
+    check_sensors(pair.sensors, resolution, crs, choices)
     run = match_pair(pair.left, pair.right, out, config, window=window, keep_tiles=keep_tiles, **how)
     made = surface_of(out, pair.sensors, progress, **cells, choices=choices)
     doubts = pair.record["warnings"] if pair.record else []
