@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 PRESETS = ("satellite", "satellite-mccnn", "paper", "mccnn", "many")
 
 # Pictures that `plot` writes to the folder of a run, without their ending.
-PICTURES = ("overview", "errors", "coverage", "range", "rows", "profile", "curve", "dsm")
+PICTURES = ("overview", "errors", "coverage", "range", "rows", "profile", "curve", "dsm", "ortho")
 
 
 class _Expert(click.Option):

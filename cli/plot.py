@@ -49,9 +49,10 @@ def plot(
     OUT/curve.png      with --pixel: cost curve of a pixel and its interval
     OUT/dsm.png        with dsm.tif: hillshade, up to 2000 cells with a pixel
                        each, height, half width, confidence
+    OUT/ortho.png      with ortho.tif: the image on the surface
     OUT/change.png     of a folder of `change`: significant changes of height
 
-    Of three images and more, only dsm.png is drawn. Rows and columns count from 0 at the first pixel of
+    Of three images and more, only dsm.png and ortho.png are drawn. Rows and columns count from 0 at the first pixel of
     OUT/intervals.tif. Needs matplotlib: pip install 'sat-intervals[plot]'.
     """  # noqa: D301 (\b keeps the line breaks in click)
     from sat_intervals.results import open_results, read_change
@@ -60,17 +61,16 @@ def plot(
     from sat_intervals.show.maps import draw_errors, draw_overview
     from sat_intervals.show.preparation import draw_range, draw_rows, has_range, has_rows
     from sat_intervals.show.profile import draw_curve, draw_profile
-    from sat_intervals.show.surface_map import draw_surface
 
     of_pair = {"row": row, "columns": columns, "pixel": pixel, "beside": beside or None}
     if changed := read_change(out):
         _refuse(of_pair | {"truth": truth}, f"{out} is a change between two dates")
         return _draw(out, {"change": partial(draw_change, out / "change.tif", changed, dpi=dpi)})
     results = open_results(out, truth)
-    of_surface = {"dsm": partial(draw_surface, out / "dsm.tif", dpi=dpi)}
+    of_surface = _of_surface(results, dpi)
     if results.is_sweep:
         _refuse(of_pair, f"{out} is of {len(results.images)} images")
-        results.check_kept([out / "dsm.png"])
+        results.check_kept([out / f"{name}.png" for name in of_surface])
         return _draw(out, of_surface)
     is_judged = results.truth is not None and results.config.interval is not None
     _check_options(results, row, columns, beside, is_judged=is_judged)
@@ -88,7 +88,16 @@ def plot(
     if pixel:
         results.check_pixel(*pixel)
         drawings["curve"] = lambda target: draw_curve(results, target, *pixel, dpi)
-    _draw(out, drawings | (of_surface if results.has_current("dsm.tif") else {}))
+    _draw(out, drawings | of_surface)
+
+
+def _of_surface(results: "Results", dpi: int) -> dict[str, Callable[[Path], None]]:
+    """Return how the surface of a run and its ortho-image are drawn, if they are there."""
+    from sat_intervals.show.surface_map import draw_ortho, draw_surface
+
+    files = ("dsm", draw_surface, results.out / "dsm.tif"), ("ortho", draw_ortho, results.ortho)
+    has = results.has_current("dsm.tif")
+    return {name: partial(draw, file, dpi=dpi) for name, draw, file in files if file and has}
 
 
 def _draw(out: Path, drawings: Mapping[str, Callable[[Path], None]]) -> None:

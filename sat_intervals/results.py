@@ -13,8 +13,17 @@ from sat_intervals.config import Config, Regularization, load_config
 from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.kernels.row_offsets import RowOffsets
-from sat_intervals.products import BANDS, REGULARIZED, Bands
-from sat_intervals.raster import Georeferencing, Image, check_not_replaced, open_image, path_of, read_layers, read_tags
+from sat_intervals.products import BANDS, ORTHO, REGULARIZED, Bands
+from sat_intervals.raster import (
+    Georeferencing,
+    Image,
+    check_not_replaced,
+    open_image,
+    path_of,
+    read_layers,
+    read_place,
+    read_tags,
+)
 from sat_intervals.raster.identity import absolute_in, identities
 from sat_intervals.raster.images import opened
 from sat_intervals.raster.layers import is_surface_of, tags_beside
@@ -128,6 +137,15 @@ class Run:
             return file.exists()
         _LOG.warning("%s is of another run and is left out: rerun sat-intervals %s", file, command)
         return False
+
+    @property
+    def ortho(self) -> Path | None:
+        """Return the ortho-image of the surface of the run, on its grid; None without one."""
+        surface, ortho = self.out / "dsm.tif", self.out / ORTHO
+        if not (ortho.exists() and self.has_current("dsm.tif")):
+            return None
+        is_of = read_tags(ortho).get("RUNS") == read_tags(surface).get("RUNS")
+        return ortho if is_of and read_place(ortho) == read_place(surface) else None
 
     def check_kept(self, outputs: Iterable[str | Path], inputs: Iterable[str | Path | None] = ()) -> None:
         """Raise if an output would replace a file of the run, its inputs, a given truth, or one of ``inputs``."""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.products import SURFACE, SURFACE_OF_SWEEP, Band, interval_bands
+from sat_intervals.products import ORTHO, SURFACE, SURFACE_OF_SWEEP, Band, interval_bands
 from sat_intervals.raster import RemotePath, acquired, footprint, path_of, read_layers, read_place, read_tags
 from sat_intervals.raster.publishing import write_record
 from sat_intervals.results import Run, open_run
@@ -35,7 +35,7 @@ def write_item(out: str | Path, *, taken: str | None = None, identifier: str | N
     ``taken`` is when the left image was taken, ISO 8601 with a time zone; by default the time in its TIFF tags. Without
     one, it is null, between the first satellite image and the end of the run. Of a sweep of many images it is null,
     between their first and last day if their tags have them all.
-    ``dsm.tif``, ``overview.png`` and ``report.html`` are assets if they belong to this run.
+    ``dsm.tif``, ``ortho.tif``, ``overview.png`` and ``report.html`` are assets if they belong to this run.
     """
     run = open_run(out)
     file = run.out / "stac.json"
@@ -154,6 +154,10 @@ def _assets(run: Run) -> Iterator[tuple[str, dict[str, Any]]]:
     if run.has_current("dsm.tif"):
         bands = SURFACE_OF_SWEEP if run.is_sweep else SURFACE
         yield "dsm", _raster(run, "dsm.tif", "Surface model with intervals", bands)
+    if run.ortho:
+        names = ("grey level",) if run.is_sweep else ("left", "right")
+        bands = tuple(Band(name, "", "image resampled to the surface") for name in names)
+        yield "ortho", _raster(run, ORTHO, "Ortho-image on the surface", bands)
     report = {"title": "Settings, inputs, counts, times, versions", "type": "application/json", "roles": ["metadata"]}
     yield "report", report | _file(run.out / "run.json")
     pictures = (
@@ -173,7 +177,7 @@ def _file(path: Path) -> dict[str, Any]:
 
 def _raster(run: Run, name: str, title: str, bands: tuple[Band, ...]) -> dict[str, Any]:
     path = run.out / name
-    shape, place = read_place(path) if name == "dsm.tif" else (run.shape, run.georeferencing)
+    shape, place = read_place(path) if name in ("dsm.tif", ORTHO) else (run.shape, run.georeferencing)
     asset: dict[str, Any] = {"title": title, "type": _COG, "roles": ["data"]} | _file(path)
     asset |= {"proj:shape": list(shape), "proj:code": None}
     if place.crs is not None and place.transform is not None:

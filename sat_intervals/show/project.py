@@ -13,8 +13,8 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.products import BANDS, CHANGE, ORTHO, SURFACE, SURFACE_OF_SWEEP
-from sat_intervals.raster import Georeferencing, RemotePath, open_image, path_of, read_layers, read_place, read_tags
+from sat_intervals.products import BANDS, CHANGE, SURFACE, SURFACE_OF_SWEEP
+from sat_intervals.raster import Georeferencing, RemotePath, open_image, path_of, read_layers, read_place
 from sat_intervals.raster.publishing import write_file
 from sat_intervals.raster.windows import read_small_image, read_small_layers
 from sat_intervals.results import Run, open_input, open_run, read_change
@@ -126,23 +126,13 @@ def _surface(run: Run) -> Iterator[ProjectLayer]:
     yield ProjectLayer(group, "half width", "half the width of the height's interval, m", half, wide, True)
     yield ProjectLayer(group, "confidence of heights", meanings["confidence"], surface, styles.shares(5))
     ramp = styles.colours(1, height, styles.VIRIDIS, unit="m")
-    ortho = [*_ortho(run)]
-    yield ProjectLayer(group, _HEIGHT, meanings["height"], surface, ramp, True, not ortho, _MULTIPLY)
-    yield from ortho
-    yield ProjectLayer(group, "hillshade", "shaded heights", surface, styles.hillshade(1), is_shown=True)
-
-
-def _ortho(run: Run) -> Iterator[ProjectLayer]:
-    """Yield the ortho-image beside the surface, if it is one of the same run, on its grid."""
-    file, surface = run.out / ORTHO, run.out / "dsm.tif"
-    if file.exists() and read_tags(file).get("RUNS") == read_tags(surface).get("RUNS"):
-        shape, place = read_place(file)
-        if (shape, place) != read_place(surface):
-            return
-        grey = styles.grey(1, read_small_layers(file, _fitting(shape))[0])
+    yield ProjectLayer(group, _HEIGHT, meanings["height"], surface, ramp, True, not run.ortho, _MULTIPLY)
+    if run.ortho:
+        grey = styles.grey(1, read_small_layers(run.ortho, _fitting(shape))[0])
         yield ProjectLayer(
-            "Heights", "ortho-image", "image on the surface", Raster(file, place, shape), grey, True, True
+            group, "ortho-image", "image on the surface", Raster(run.ortho, place, shape), grey, True, True
         )
+    yield ProjectLayer(group, "hillshade", "shaded heights", surface, styles.hillshade(1), is_shown=True)
 
 
 def _change(out: Path) -> Iterator[ProjectLayer]:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.products import SURFACE
-from sat_intervals.raster import read_small_layers, read_tags, surface_place
+from sat_intervals.raster import read_place, read_small_layers, read_tags, surface_place
 from sat_intervals.show import canvas
 from sat_intervals.show.legend import limits, widest
 from sat_intervals.show.relief import relief
@@ -62,6 +62,18 @@ def draw_surface(surface: Path, target: Path, dpi: int = canvas.DPI) -> None:
             panel.patch.set(facecolor="white", hatch="////", edgecolor=canvas.NOTHING, linewidth=0)
         for panel in panels[len(layers) :]:
             panel.remove()
+
+
+def draw_ortho(ortho: Path, target: Path, dpi: int = canvas.DPI) -> None:
+    """Draw the first band of an ortho-image with a pixel a cell."""
+    shape, place = read_place(ortho)
+    grey = read_small_layers(ortho, canvas.fitting(shape, canvas.map_size(shape, 1.0), _MOST_CELLS))[0]
+    (tall, wide), (low, high) = canvas.map_size(shape, _LONGEST), limits(grey)
+    frame, dots = canvas.PlotFrame.on_map(place, shape), max(dpi, -(-max(grey.shape) // _SHOWN))
+    with canvas.page(target, (wide + 0.8, tall + 1.0), int(dots), ortho.name) as figure:
+        panel = figure.subplots()
+        canvas.draw_map(panel, frame, grey, "Image on the surface; grey: no data", cmap="gray", vmin=low, vmax=high)
+        canvas.add_scale_bar(panel, frame)
 
 
 def _layers(height: np.ndarray, halves: np.ndarray, bands: dict[str, np.ndarray], end: float) -> list[canvas.MapLayer]:

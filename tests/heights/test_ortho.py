@@ -10,7 +10,10 @@ from helpers import invoke, refused, write_pair
 from surfaces import write_geoid, write_raster
 
 from sat_intervals.demo import make_scene
+from sat_intervals.heights.choices import SurfaceChoices
+from sat_intervals.heights.dsm import check_sensors
 from sat_intervals.heights.ortho import hidden, median_of, write_ortho_of
+from sat_intervals.heights.rectify import rectified_files
 from sat_intervals.raster import Projection, read_layers, read_place
 from sat_intervals.results import open_run
 
@@ -81,6 +84,33 @@ def test_surface__ortho_shows_the_left_image_where_the_ground_is(made, scene):
     ortho = read_layers(made / "ortho.tif", band=1)
     assert not np.isfinite(ortho[np.isnan(height)]).any()
     assert 0 < np.isnan(ortho[np.isfinite(height)]).mean() < 0.1  # hidden, or outside the image
+    right = read_layers(made / "ortho.tif", band=2)
+    seen = np.isfinite(ortho) & np.isfinite(right)
+    assert seen.mean() > 0.6
+    assert np.corrcoef(ortho[seen], right[seen])[0, 1] > 0.9
+    assert (np.isnan(ortho) != np.isnan(right)).any()  # what one image sees, another need not
+
+
+@pytest.mark.peer("shareloc", "matplotlib")
+def test_surface__ortho_is_known_by_plot_and_stac(made, tmp_path):
+    out = shutil.copytree(made, tmp_path / "out")
+    assert "ortho.png" in invoke("plot", out).output
+    assert invoke("stac", out).exit_code == 0
+    assets = json.loads((out / "stac.json").read_text())["assets"]
+    assert [band["name"] for band in assets["ortho"]["bands"]] == ["left", "right"]
+    assert assets["ortho"]["proj:shape"] == assets["dsm"]["proj:shape"]
+
+
+@pytest.mark.peer("shareloc")
+def test_check_sensors__looks_for_areas_before_matching(made, tmp_path, caplog):
+    (rows, columns), place = read_place(made / "dsm.tif")
+    inside = np.zeros((1, rows, columns))
+    inside[0, 20:40, 20:40] = 1
+    files = rectified_files(made / "left.tif", made / "right.tif")
+    for name, moved in (("here", 0), ("away", 90_000)):
+        mask = write_raster(tmp_path / f"{name}.tif", inside, place.moved(moved, 0).transform)
+        check_sensors(files, CELL, "EPSG:32631", SurfaceChoices(mask=mask))
+    assert [record.args[0].name for record in caplog.records] == ["away.tif"]
 
 
 @pytest.mark.peer("shareloc")
