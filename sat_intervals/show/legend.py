@@ -68,5 +68,5 @@ def limits(values: np.ndarray, otherwise: tuple[float, float] = (0, 1), cut: flo
 def widest(widths: np.ndarray, cut: float, times: float = np.inf) -> float:
     """Return the finite width that ``cut`` percent exceed, at most so many medians; 1 if it is zero or without any."""
     known = widths[np.isfinite(widths)]
-    most, middle = np.percentile(known, (100 - cut, 50), method="nearest") if known.size else (1.0, 1.0)
-    return float(min(most, times * middle) or 1.0)
+    most, middle = np.percentile(known, (100 - cut, 50), method="nearest").tolist() if known.size else (1.0, 1.0)
+    return float(min(most, times * middle or most) or 1.0)
