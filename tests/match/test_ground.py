@@ -53,7 +53,7 @@ def test_positions__and_corners_are_those_of_the_camera(image):
     disparities = np.array([-40.0, 0.0, 3.5, 70.0])
     y, x = np.meshgrid([64.0, 128.0], [128.0, 192.0], indexing="ij")
     places = np.array([there(image, y, x, np.full((2, 2), 35 + 0.5 * one)) for one in disparities])
-    np.testing.assert_allclose(views().corners(image, (1, 2), disparities), reduced(image, places), atol=1e-9)
+    np.testing.assert_allclose(views().corners((1, 2), disparities)[image], reduced(image, places), atol=1e-9)
     window = Window(37, 90, 60, 70)
     disparity = np.random.default_rng(0).uniform(-45, 60, (60, 70))
     y, x = np.mgrid[37:97, 90:160] + 0.5
