@@ -95,9 +95,10 @@ def _of_surface(results: "Results", dpi: int) -> dict[str, Callable[[Path], None
     """Return how the surface of a run and its ortho-image are drawn, if they are there."""
     from sat_intervals.show.surface_map import draw_ortho, draw_surface
 
+    if not results.has_current("dsm.tif"):
+        return {}
     files = ("dsm", draw_surface, results.out / "dsm.tif"), ("ortho", draw_ortho, results.ortho)
-    has = results.has_current("dsm.tif")
-    return {name: partial(draw, file, dpi=dpi) for name, draw, file in files if file and has}
+    return {name: partial(draw, file, dpi=dpi) for name, draw, file in files if file}
 
 
 def _draw(out: Path, drawings: Mapping[str, Callable[[Path], None]]) -> None:

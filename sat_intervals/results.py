@@ -140,9 +140,9 @@ class Run:
 
     @property
     def ortho(self) -> Path | None:
-        """Return the ortho-image of the surface of the run, on its grid; None without one."""
+        """Return the ortho-image of a current surface of the run, on its grid; None without one."""
         surface, ortho = self.out / "dsm.tif", self.out / ORTHO
-        if not (ortho.exists() and self.has_current("dsm.tif")):
+        if not ortho.exists():
             return None
         is_of = read_tags(ortho).get("RUNS") == read_tags(surface).get("RUNS")
         return ortho if is_of and read_place(ortho) == read_place(surface) else None

@@ -25,7 +25,7 @@ from sat_intervals.tiling import Window
 _SMALLEST = 16
 # What pulls the mean of all shifts to 0, or the reference, in inverse metres.
 _HELD = 1e3
-_LEAST = 0.01  # metres: least deviation of a shift
+_LEAST, _FAR = 0.01, 500.0  # metres: least deviation of a shift; largest difference from a reference in height
 
 
 def aligned(
@@ -56,6 +56,11 @@ def aligned(
     for cloud, shift, deviation in zip(clouds, shifts, deviations, strict=False):
         if reference and np.isnan(deviation[2]):
             raise SatIntervalsError(f"{cloud.run.out} has no ground with {reference}: give a reference of this place")
+        if reference and abs(shift[2]) > _FAR:
+            raise SatIntervalsError(
+                f"{cloud.run.out} and {reference} differ by {shift[2]:.0f} m in height: check that both are metres "
+                "above the same datum"
+            )
         lattice = cloud.ground.lattice
         moved.append(PointCloud(cloud.run, replace(lattice, nodes=lattice.nodes + shift), cloud.choices))
         known_deviation = [one if np.isfinite(one) else None for one in deviation.tolist()]

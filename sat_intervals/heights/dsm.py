@@ -28,6 +28,7 @@ from sat_intervals.raster import (
     north_up,
     path_of,
     read_place,
+    read_tags,
     run_files,
     surface_file,
     utm_of,
@@ -143,6 +144,8 @@ def _completed(run: Run, path: Path, choices: SurfaceChoices, progress: Progress
     completion = completion_of(place.pixel_size[0], choices)
     if completion is None or replace(choices, fill=None, flatten=None, mask=None) != SurfaceChoices():
         raise SatIntervalsError(f"{run.out} has the surface of many images: give fill, flatten or mask, and no more")
+    if done := {"FILLED", "FLATTENED", "MASKED"} & read_tags(measured).keys():
+        raise SatIntervalsError(f"{measured} is {' and '.join(sorted(done)).lower()} already: complete one that is not")
     run.check_kept([path], [measured, choices.flatten, choices.mask])
     file, _ = run_files(run.config.products.compression, of_heights=True)
     completed = complete(measured, path, file, completion.on(place, (rows, columns)), progress)
@@ -218,7 +221,7 @@ def checked_cells(
     """Check the arguments of `make_surface` that need no run; return grid of a raster, resolution, CRS and radius."""
     grid = None
     if resolution is None:
-        raise SatIntervalsError("no resolution: give the side of a cell, or a raster whose grid is taken")
+        raise SatIntervalsError("give either --resolution, the side of a cell, or --grid-like, a raster with the grid")
     if isinstance(resolution, Path):
         grid, crs = _grid_of(resolution, crs)
         resolution = grid.resolution
@@ -258,7 +261,8 @@ def check_sensors(
         row, column = (axis.ravel() for axis in np.meshgrid(*ends))
         points = sensors.triangulate(row, column, np.zeros(9))
         x, y = projection.place(*points[np.isfinite(points).all(axis=1), :2].T)
-        cells = Cells.over(Extent(x.min(), y.min(), x.max(), y.max()), resolution)
+        wide, high = np.ptp(x), np.ptp(y)  # heights move the ground: only other places are far from it
+        cells = Cells.over(Extent(x.min() - wide, y.min() - high, x.max() + wide, y.max() + high), resolution)
         completion.on(north_up(projection.crs, cells.left, cells.top, resolution), (cells.rows, cells.columns))
 
 

@@ -154,10 +154,10 @@ def _assets(run: Run) -> Iterator[tuple[str, dict[str, Any]]]:
     if run.has_current("dsm.tif"):
         bands = SURFACE_OF_SWEEP if run.is_sweep else SURFACE
         yield "dsm", _raster(run, "dsm.tif", "Surface model with intervals", bands)
-    if run.ortho:
-        names = ("grey level",) if run.is_sweep else ("left", "right")
-        bands = tuple(Band(name, "", "image resampled to the surface") for name in names)
-        yield "ortho", _raster(run, ORTHO, "Ortho-image on the surface", bands)
+        if run.ortho:
+            names = ("grey level",) if run.is_sweep else ("left", "right")
+            bands = tuple(Band(name, "", "image resampled to the surface") for name in names)
+            yield "ortho", _raster(run, ORTHO, "Ortho-image on the surface", bands)
     report = {"title": "Settings, inputs, counts, times, versions", "type": "application/json", "roles": ["metadata"]}
     yield "report", report | _file(run.out / "run.json")
     pictures = (

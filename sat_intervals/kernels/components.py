@@ -40,4 +40,6 @@ def components(values, known):
 def component_sizes(disparity: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Return the size of the component of each pixel of a disparity map, 0 where nothing is known."""
     labels = components(disparity, known)
-    return np.asarray(known * np.bincount(labels.ravel())[labels])
+    sizes = np.bincount(labels.ravel()).astype(np.int32)
+    sizes[0] = 0
+    return np.asarray(sizes[labels])

@@ -80,6 +80,8 @@ def open_epoch(path: str | Path, sigma: float | None = None) -> Epoch:
         raise SatIntervalsError(f"{path} is on no map in metres: resample it to one, such as with gdalwarp")
     with opened(str(path)) as dataset:
         names, tags = dataset.descriptions, dataset.tags()
+    if "FALSE_ALARMS" in tags:
+        raise SatIntervalsError(f"{path} is a change of height: give the surface models of both dates")
     level = tags.get("HEIGHTS", "")
     if names == tuple(band.name for band in SURFACE):
         if "COVERAGE" not in tags:

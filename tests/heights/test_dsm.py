@@ -267,6 +267,7 @@ def test_make_surface__refuses_a_reference_that_says_nothing(tmp_path):
 
     for choices, message in (
         (reference("elsewhere.tif", np.full((40, 40), 500.0), left=place.c + 9000), "has no ground with .*elsewhere"),
+        (reference("feet.tif", np.full((60, 60), 1640.0)), "differ by 114. m in height: check that both are metres"),
         (SurfaceChoices(reference=tmp_path / "none.tif"), "none.tif"),
     ):
         with pytest.raises(SatIntervalsError, match=message):

@@ -229,7 +229,7 @@ def test_change__refuses_in_one_line(dates, changed, tmp_path):
     feet = write_date(tmp_path / "feet.tif", 1, crs="EPSG:2236")
     refused(["change", before, feet, tmp_path], "feet.tif is on no map in metres")
     refused(["change", before, after, tmp_path, "--sigma", 1], "both surfaces have bounds: leave sigma out")
-    refused(["change", before, dates / "out" / "change.tif", tmp_path], "change.tif has neither bounds nor")
+    refused(["change", before, dates / "out" / "change.tif", tmp_path], "change.tif is a change of height")
     elsewhere = write_raster(tmp_path / "elsewhere.tif", np.ones((1, 9, 9)), PLACE @ Affine.translation(9000, 0))
     refused(["change", before, after, tmp_path / "new", "--stable", elsewhere], "elsewhere.tif has no ground that both")
 
