@@ -18,7 +18,7 @@ from rasterio.shutil import copy
 from raw import raw_pair
 from services.s3 import away_from
 
-from sat_intervals import match_pair, open_surface
+from sat_intervals import SurfaceChoices, match_pair, open_surface
 from sat_intervals import open as open_dataset
 from sat_intervals.demo import make_scene
 from sat_intervals.raster import find_model, path_of, read_layers
@@ -214,9 +214,9 @@ def test_surface__from_bucket_to_bucket_gives_the_bytes_of_a_local_run_though_a_
 def test_surface__of_many_in_a_bucket_has_the_bytes_of_a_local_folder(bucket, tmp_path):
     images, _ = write_views(tmp_path, 120, 130, 3, 1)
     urls = upload(tmp_path, f"{bucket}/many")[: len(images)]
-    surface(urls, tmp_path / "out", resolution=0.5, ortho=True)
+    surface(urls, tmp_path / "out", resolution=0.5, choices=SurfaceChoices(ortho=True))
     spread = {"preset": "many", "tiles": {"size": 64}, "cluster": {"kind": "processes", "workers": 2}}
-    surface(urls, f"{bucket}/many-out", spread, resolution=0.5, ortho=True)
+    surface(urls, f"{bucket}/many-out", spread, resolution=0.5, choices=SurfaceChoices(ortho=True))
     assert_same(f"{bucket}/many-out", tmp_path / "out", "dsm.tif", "ortho.tif", "validity.tif")
     assert sorted(objects(f"{bucket}/many-out")) == ["dsm.tif", "ortho.tif", "run.json", "validity.tif"]
 
