@@ -31,7 +31,8 @@ def check_file(path: str | os.PathLike[str], remedy: str) -> None:
     try:
         reason = None if file.is_file() else "is a folder" if file.is_dir() else "no such file"
     except OSError as error:
-        reason = error.strerror
+        way = "check server and credentials" if "://" in str(file) else remedy
+        raise SatIntervalsError(f"{file}: {error.strerror}: {way}") from error
     if reason:
         raise SatIntervalsError(f"{file}: {reason}: {remedy}")
 

@@ -70,9 +70,9 @@ def check_names(names: Iterable[str], where: str = "") -> None:
             raise SatIntervalsError(f"{where}{count} pairs or runs are called {name}: give each its own name")
 
 
-def group_beside(image: str | Path) -> str:
+def group_beside(image: Path) -> str:
     """Return the group in the ``meta.json`` beside an image, NO_GROUP without one."""
-    meta = Path(image).parent / "meta.json"
+    meta = image.parent / "meta.json"
     return str(_meta(meta).get("group", NO_GROUP)) if meta.exists() else NO_GROUP
 
 

@@ -16,6 +16,7 @@ from sat_intervals.raster import path_of
 from sat_intervals.raster.identity import absolute_in, identity, local_file, relative_in
 from sat_intervals.raster.publishing import write_record
 from sat_intervals.results import Run, open_run
+from sat_intervals.store.manifest import changes
 
 if TYPE_CHECKING:
     from sat_intervals.heights.sensors import Sensors
@@ -85,7 +86,7 @@ def geometry_of(run: Run, progress: Progress = lambda stage, done, total: None) 
     images = [run.report["inputs"][side] for side in ("left", "right")]
     if not (run.out / FILE).exists() and (made := rectified_files(*(image["path"] for image in images))):
         for image in images:
-            if _content(identity(image["path"], {image["path"]: image})) != _content(image):
+            if _has_changed(image):
                 raise SatIntervalsError(
                     f"{image['path']} was rectified again since {run.out} was made: match it again with --overwrite"
                 )
@@ -114,6 +115,13 @@ def _content(record: Mapping[str, Any]) -> Any:
     return record.get("sha256", record.get("etag"))
 
 
+def _has_changed(record: Mapping[str, Any]) -> bool:
+    """Return whether a file has another content than its record; RunError if its server does not answer."""
+    path = record["path"]
+    before, now = ({"content": _content(one)} for one in (record, identity(path, {path: record})))
+    return bool(changes(path, before, now))
+
+
 def _images(run: Run) -> list[str]:
     """Return what tells the images of a run from others."""
     return [_content(image) or image["path"] for image in map(run.report["inputs"].get, ("left", "right"))]
@@ -132,9 +140,9 @@ def _noted(run: Run) -> list[Path]:
         raise SatIntervalsError(f"{file} cannot be read: {_GIVE}") from error
     if images != _images(run):
         raise SatIntervalsError(f"{file} is of other images than {run.out} now: {_GIVE}")
-    for path, record in zip(paths, known, strict=True):
+    for path, one in zip(paths, known, strict=True):
         check_file(local_file(path) or path_of(path), _GIVE)
-        if _content(identity(path, {path: record})) != _content(record):
+        if _has_changed(one):
             raise SatIntervalsError(f"{path} has changed since {file} was written: {_GIVE}")
     return [path_of(path) for path in paths]
 

@@ -34,7 +34,7 @@ class PointFile:
     def __init__(
         self, path: Path, crs: str | None, vertical: Vertical, surface: tuple[str | None, str] = (None, "")
     ) -> None:
-        check_file(path, "give a file of points")
+        check_here(path, "give a file of points")
         self._path, ending = path, path.suffix.lower()
         is_cloud = ending in (".las", ".laz")
         crs_of = _crs_of_las if is_cloud else _crs_of_table
@@ -54,6 +54,13 @@ class PointFile:
                 places = part[:, :3]
                 known = np.isfinite(places).all(axis=1) & is_ground(places[:, 2] * self.frame.unit)
                 yield part[known] if with_sigma else places[known]
+
+
+def check_here(path: Path, remedy: str) -> None:
+    """Raise if a file that is read from disks only is missing, or on a server."""
+    if re.match(r"\w+:/|/vsicurl/", str(path)):
+        raise SatIntervalsError(f"{path} is on a server: download it")
+    check_file(path, remedy)
 
 
 @contextmanager

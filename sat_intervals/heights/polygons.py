@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError, check_file
-from sat_intervals.heights.point_files import reading
+from sat_intervals.heights.point_files import check_here, reading
 from sat_intervals.raster import Georeferencing
 from sat_intervals.raster.polygons import Areas, Polygon, areas_of_raster
 from sat_intervals.raster.publishing import write_file
@@ -33,9 +33,11 @@ def write_polygons(
 
 def read_areas(path: Path) -> Areas:
     """Read polygons, or a raster that is not 0 in areas."""
-    check_file(path, "give a raster or a file of polygons")
-    if path.suffix.lower() not in _VECTORS:
+    is_raster, remedy = path.suffix.lower() not in _VECTORS, "give a raster or a file of polygons"
+    if is_raster:
+        check_file(path, remedy)
         return areas_of_raster(path)
+    check_here(path, remedy)
     with reading(path, "polygons"):
         import shapely
         from pyogrio.raw import read

@@ -12,7 +12,7 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import Band
-from sat_intervals.raster import File, Georeferencing, OutputWriter, check_free
+from sat_intervals.raster import File, Georeferencing, OutputWriter, check_free, path_of
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window, strips
 
@@ -68,7 +68,7 @@ def export(out: str | Path, form: str, target: str | Path, *, overwrite: bool = 
 
     For ``asp`` the target is the prefix of the file, such as ``stereo/run`` of ``stereo/run-F.tif``.
     """
-    run, target = open_run(out), Path(target)
+    run, target = open_run(out), path_of(target)
     run.check_pair()
     left = run.report["inputs"]["left"]
     shape = left["height"], left["width"]

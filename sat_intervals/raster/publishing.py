@@ -16,7 +16,7 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import as_json
 from sat_intervals.raster import gdal
 from sat_intervals.raster.files import File
-from sat_intervals.store.remote import RemotePath, disk_of, is_folder, is_there, path_of
+from sat_intervals.store.remote import RemotePath, disk_of, is_there, path_of
 
 _REMEDY = "free disk space or choose another folder"
 # Errors of the path: more space does not help.
@@ -32,9 +32,10 @@ class OutputError(SatIntervalsError):
 def check_free(path: str | os.PathLike[str], *, overwrite: bool) -> None:
     """Raise OutputError if a file exists that may not be replaced, or a folder has its name."""
     path = path_of(path)
-    if is_folder(path):
+    is_used = is_there(path)
+    if is_used and path.is_dir():
         raise OutputError(f"{path} is a folder: choose another name")
-    if is_there(path) and not overwrite:
+    if is_used and not overwrite:
         raise OutputError(f"{path} exists: choose another name or --overwrite")
 
 

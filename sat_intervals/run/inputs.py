@@ -9,7 +9,7 @@ from sat_intervals.errors import ChangedInputError, RunError
 from sat_intervals.products import plain
 from sat_intervals.raster import Image, describe, open_image
 from sat_intervals.raster.identity import identity
-from sat_intervals.store.manifest import differences
+from sat_intervals.store.manifest import changes
 
 
 def describe_inputs(images: Mapping[str, Image], config: Config, known: Mapping[str, Any]) -> dict[str, Any]:
@@ -28,12 +28,9 @@ def check_unchanged(before: Mapping[str, Any], images: Mapping[str, Image], conf
         now = plain(describe_inputs(images, config, {}))
     except (OSError, ChangedInputError) as error:
         raise RunError(f"an input cannot be compared now: {error}; rerun the same command: it resumes") from error
-    changes = list(differences(before, now))
-    if silent := [change for change in changes if change.endswith("now null")]:  # a server
-        raise RunError(f"an input cannot be compared now ({silent[0]}); rerun the same command: it resumes")
-    if changes:
-        path = before[changes[0].partition(".")[0]]["path"]
+    if changed := changes("an input", before, now):
+        path = before[changed[0].partition(".")[0]]["path"]
         raise ChangedInputError(
-            f"{path} was changed during the run ({'; '.join(changes)}), so its tiles are deleted: rerun the command "
+            f"{path} was changed during the run ({'; '.join(changed)}), so its tiles are deleted: rerun the command "
             "when the file is complete"
         )

@@ -211,9 +211,9 @@ def _note_failure(job: Job, tile: Tile, error: BaseException) -> None:
     """Note why a tile failed, where a full disk must not end the run, but a server that is away must."""
     try:
         job.store.write(FAILURES, tile.name, reason=reason(error))
-    except OSError:
+    except OSError as failed:
         if not job.store.folder.is_local:
-            raise
+            raise RunError(f"{reason(failed)}: rerun the same command: it resumes") from failed
 
 
 def _schedule(job: Job, tiles: Sequence[Tile]) -> Schedule:

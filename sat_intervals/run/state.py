@@ -10,7 +10,7 @@ from sat_intervals.errors import ChangedInputError, SatIntervalsError
 from sat_intervals.products import plain
 from sat_intervals.raster import RUN_FILES, File, RemotePath, run_files
 from sat_intervals.store.manifest import MANIFEST, StoreError, differences, read_manifest
-from sat_intervals.store.remote import is_folder, is_there
+from sat_intervals.store.remote import is_there
 from sat_intervals.store.tiles import home_of
 
 RUN_REPORT = "run.json"
@@ -60,16 +60,17 @@ def is_complete(out: Path) -> bool:
 
 def check_folder(out: Path, *, overwrite: bool, names: Sequence[str] = OUTPUTS) -> None:
     """Raise if a folder cannot be that of a run, or has files of its names that no run has made."""
-    if is_there(out) and not is_folder(out):
+    if is_there(out) and not out.is_dir():
         raise SatIntervalsError(f"{out} is not a folder: choose another")
-    if folders := [name for name in names if is_folder(out / name)]:
+    there = [name for name in names if is_there(out / name)]
+    if folders := [name for name in there if (out / name).is_dir()]:
         raise SatIntervalsError(f"{out / folders[0]} is a folder: move it away or choose another folder")
     if overwrite or read_report(out) is not None:
         return
     is_begun = is_there(home_of(out) / MANIFEST)  # a death may have left rasters, but no report
-    if there := [name for name in names if is_there(out / name) and (not is_begun or name == RUN_REPORT)]:
+    if foreign := [name for name in there if not is_begun or name == RUN_REPORT]:
         raise SatIntervalsError(
-            f"{out / there[0]} exists and is of no complete run: move it away, choose another folder or "
+            f"{out / foreign[0]} exists and is of no complete run: move it away, choose another folder or "
             "--overwrite (overwrite=True)"
         )
 

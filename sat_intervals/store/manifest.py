@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.products import as_json
 from sat_intervals.store.folder import Folder, folder_at
 from sat_intervals.tiling import Grid, Window
@@ -74,6 +74,14 @@ def differences(there: Any, wanted: Any, path: str = "") -> Iterator[str]:
             yield from differences(*pair, f"{path}.{place}")
     elif there != wanted:
         yield f"{path} was {_short(there)}, now {_short(wanted)}"
+
+
+def changes(what: str, before: Any, now: Any) -> list[str]:
+    """Return the differences of inputs from their description; raise RunError if a server does not answer now."""
+    found = list(differences(before, now))
+    if silent := [change for change in found if change.endswith("now null")]:
+        raise RunError(f"{what} cannot be compared now ({silent[0]}): rerun the same command when its server answers")
+    return found
 
 
 def _short(value: Any) -> str:

@@ -6,6 +6,7 @@ or from fsspec's.
 
 import errno
 import hashlib
+import io
 import os
 import stat
 import tempfile
@@ -37,10 +38,34 @@ def reached(place: str) -> Iterator[Any]:
         raise OSError(number, why, place) from error
 
 
+class _Stream(io.RawIOBase):
+    """An open file of a bucket, whose reads go through `reached`, too."""
+
+    def __init__(self, place: str) -> None:
+        self._place = place
+        with reached(place) as system:
+            self._file = system.open(place, "rb", block_size=_BLOCK, cache_type="readahead")
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        return int(self._file.seek(offset, whence))
+
+    def tell(self) -> int:
+        return int(self._file.tell())
+
+    def readinto(self, buffer: Any) -> int:
+        with reached(self._place):
+            return int(self._file.readinto(buffer))
+
+
 def opened_at(place: str) -> Any:
     """Open a file of a bucket for reading any part of it."""
-    with reached(place) as system:
-        return system.open(place, "rb", block_size=_BLOCK, cache_type="readahead")
+    return _Stream(place)
 
 
 class RemotePath(PosixPath):
@@ -59,37 +84,42 @@ class RemotePath(PosixPath):
         """Return the path."""
         return self
 
-    def resolve(self, strict: bool = False) -> "RemotePath":
+    def resolve(self, *_: Any, **__: Any) -> "RemotePath":
         """Return the path."""
         return self
 
-    def stat(self, *, follow_symlinks: bool = True) -> os.stat_result:
-        """Return kind, size and the second of the last change."""
+    def stat(self, **_: Any) -> os.stat_result:
+        """Return kind, size and the second of the last change of a file, 0 where its store does not say."""
+        changed = 0
         with reached(str(self)) as system:
             found = system.info(str(self))
+            if found["type"] == "file":
+                with suppress(KeyError, NotImplementedError):
+                    changed = int(system.modified(str(self)).timestamp())
         kind = stat.S_IFREG if found["type"] == "file" else stat.S_IFDIR
-        changed = found.get("LastModified")
-        return os.stat_result((kind, 0, 0, 0, 0, 0, found["size"] or 0, 0, changed and int(changed.timestamp()), 0))
+        return os.stat_result((kind, 0, 0, 0, 0, 0, found["size"] or 0, 0, changed, 0))
 
-    def _kind(self) -> int:
-        with suppress(FileNotFoundError):
-            return self.stat().st_mode
-        return 0
+    def _kind(self) -> str:
+        with suppress(FileNotFoundError), reached(str(self)) as system:
+            return str(system.info(str(self))["type"])
+        return ""
 
-    def exists(self, *, follow_symlinks: bool = True) -> bool:
+    def exists(self, **_: Any) -> bool:
         """Return whether there is a file, or a folder with one."""
         return bool(self._kind())
 
     def is_file(self) -> bool:
         """Return whether it is a file."""
-        return self._kind() == stat.S_IFREG
+        return self._kind() == "file"
 
     def is_dir(self) -> bool:
         """Return whether files are in it."""
-        return self._kind() == stat.S_IFDIR
+        return self._kind() == "directory"
 
-    def open(self, *_: Any, **__: Any) -> Any:
+    def open(self, mode: str = "rb", *_: Any, **__: Any) -> Any:
         """Open it for reading bytes."""
+        if mode != "rb":
+            raise OSError(errno.ENOTSUP, f"is in a bucket, not opened as {mode!r}", str(self))
         return opened_at(str(self))
 
     def read_bytes(self) -> bytes:
@@ -97,15 +127,15 @@ class RemotePath(PosixPath):
         with reached(str(self)) as system:
             return bytes(system.cat_file(str(self)))
 
-    def read_text(self, encoding: str | None = None, errors: str | None = None, newline: str | None = None) -> str:
-        """Read it whole."""
-        return self.read_bytes().decode(encoding or "utf-8", errors or "strict")
+    def read_text(self, *how: Any, **named: Any) -> str:
+        """Read it whole, by default as UTF-8."""
+        return self.read_bytes().decode(*how, **named)
 
-    def mkdir(self, mode: int = 0o777, parents: bool = False, exist_ok: bool = False) -> None:
+    def mkdir(self, *_: Any, **__: Any) -> None:
         """Do nothing: folders are there with their files."""
 
-    def unlink(self, missing_ok: bool = False) -> None:
-        """Delete it; ``missing_ok`` is always true."""
+    def unlink(self, *_: Any, **__: Any) -> None:
+        """Delete it, if it exists."""
         with suppress(FileNotFoundError), reached(str(self)) as system:
             system.rm_file(str(self))
 
@@ -129,11 +159,6 @@ def is_there(path: Path) -> bool:
     return path.exists() if isinstance(path, RemotePath) else os.path.lexists(path)
 
 
-def is_folder(path: Path) -> bool:
-    """Return whether a path is a folder."""
-    return path.is_dir() if isinstance(path, RemotePath) else os.path.isdir(path)
-
-
 def disk_of(folder: Path) -> Path:
     """Return where lock and unfinished files of a folder are: in it; of a bucket, among temporary files (`TMPDIR`)."""
     if not isinstance(folder, RemotePath):
@@ -145,10 +170,9 @@ def disk_of(folder: Path) -> Path:
 def object_tag(url: str) -> dict[str, Any]:
     """Return size in bytes and ETag of an object; empty if fsspec cannot reach it."""
     try:
-        system, path = fsspec.url_to_fs(url)
-        system.invalidate_cache(path)
-        content = system.info(path)
-    except Exception:  # of many libraries
+        with reached(url) as system:
+            content = system.info(url)
+    except OSError:
         return {}
     tag = content.get("ETag") or content.get("etag") or content.get("LastModified")
     return {"bytes": content.get("size"), "etag": None if tag is None else str(tag)}

@@ -12,7 +12,7 @@ from sat_intervals.config import Calibration, Cluster, Config, load_config, name
 from sat_intervals.config.pairs import Pair, group_beside
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.progress import Progress
-from sat_intervals.raster import OutputError, check_not_replaced, open_image
+from sat_intervals.raster import OutputError, check_not_replaced, open_image, path_of
 from sat_intervals.raster.publishing import check_free, write_file
 from sat_intervals.results import open_results
 from sat_intervals.run.calibrate import calibration_from, check_scenes
@@ -79,7 +79,7 @@ def calibrate(
     RunError
         Tiles failed.
     """
-    output, paths, files = Path(output), [Path(one) for one in pairs], [Path(one) for one in truths]
+    output, paths, files = path_of(output), [*map(path_of, pairs)], [*map(path_of, truths)]
     scenes = scenes_of(paths, files, Choices(config, overrides, tolerance, remove_bias, by_group))
     _check_kept(scenes, [*paths, *files], config, output)
     check_output(output, overwrite=overwrite)
@@ -139,7 +139,7 @@ def _of_run(source: Source, choices: Choices) -> CalibrationScene:
     else:
         here = run.config.model_copy(update={"cluster": Cluster()})  # the run's may be jobs of a batch system
         config = load_config(here, choices.overrides)
-    group = group_beside(run.left.path) if choices.by_group else source.name
+    group = group_beside(path_of(run.left.path)) if choices.by_group else source.name
     judged = choices.tolerance, choices.remove_bias
     return CalibrationScene(source.name, group, run.left, run.right, run.truth, config, run.region, *judged)
 

@@ -11,6 +11,7 @@ from sat_intervals.config.pairs import Pair, group_beside
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.disparity import evaluate_run
 from sat_intervals.evaluate.paper import SceneMetrics
+from sat_intervals.raster import path_of
 from sat_intervals.results import open_run
 from sat_intervals.run.pair import match_pair
 from sat_intervals.workflows.sources import Source, find_sources
@@ -44,7 +45,7 @@ def evaluate_scenes(
             of = source.pair.group
         else:
             report = evaluate_run(source.name, source.truth, source.mask, **how)
-            of = group or group_beside(open_run(source.name).report["inputs"]["left"]["path"])
+            of = group or group_beside(path_of(open_run(source.name).report["inputs"]["left"]["path"]))
         scenes.append(SceneMetrics(source.name, group or of, report))
     return scenes
 

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from sat_intervals import SatIntervalsError
-from sat_intervals.raster import Vertical
+from sat_intervals.raster import Vertical, path_of
 
 with suppress(SatIntervalsError):  # without shareloc all tests here are skipped
     from sat_intervals.heights.point_files import PointFile
+    from sat_intervals.heights.polygons import read_areas
 
 pytestmark = pytest.mark.peer("shareloc", "pyarrow", "pyogrio", "shapely")
 
@@ -108,6 +109,9 @@ def test_point_file__says_in_one_line_what_it_cannot_read(tmp_path):
             read(tmp_path / name)
         assert message in str(error.value)
         assert "\n" not in str(error.value)
+    for reader, name in ((read, "s3://bucket/p.csv"), (read, "https://host/p.las"), (read_areas, "s3://bucket/p.gpkg")):
+        with pytest.raises(SatIntervalsError, match="is on a server: download it"):
+            reader(path_of(name))
 
 
 @pytest.mark.parametrize("ending", ["gpkg", "parquet", "csv"])

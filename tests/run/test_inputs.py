@@ -13,6 +13,7 @@ from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError
 from sat_intervals.raster import open_image, write_layer
 from sat_intervals.raster.identity import identity
 from sat_intervals.run.pair import match_pair
+from sat_intervals.store.manifest import changes
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -121,6 +122,13 @@ def test_match_pair__resumes_when_its_image_was_shown_meanwhile(small_pair, show
     assert all(file.stat().st_mtime_ns == time for file, time in done.items())
     show(folder / "right.tif")
     assert match_pair(*images, settings)["finished"] == finished
+
+
+def test_changes__are_none_of_a_file_whose_server_is_away():
+    there = {"path": "s3://bucket/left.tif", "bytes": 9, "etag": "one"}
+    assert changes("left.tif", there, there | {"etag": "two"}) == ['etag was "one", now "two"']
+    with pytest.raises(RunError, match=r"left.tif cannot be compared now .*: rerun the same command"):
+        changes("left.tif", there, {"path": "s3://bucket/left.tif"})
 
 
 def test_match_pair__refuses_to_resume_with_a_changed_input(small_pair):

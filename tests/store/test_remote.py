@@ -18,11 +18,12 @@ from rasterio.shutil import copy
 from raw import raw_pair
 from services.s3 import away_from
 
-from sat_intervals import match_pair, open_surface
+from sat_intervals import SurfaceChoices, match_pair, open_surface
 from sat_intervals import open as open_dataset
 from sat_intervals.demo import make_scene
+from sat_intervals.interop.export import export
 from sat_intervals.raster import find_model, path_of, read_layers
-from sat_intervals.store.remote import disk_of
+from sat_intervals.store.remote import RemotePath, disk_of
 from sat_intervals.workflows.demo import write_views
 from sat_intervals.workflows.surface import surface
 
@@ -146,6 +147,18 @@ def test_path_of__is_in_a_bucket_by_either_name_and_keeps_its_url(tmp_path):
     assert type(path_of("https://host/run")) is type(path_of("/vsizip/a.zip/b")) is type(tmp_path)
 
 
+def test_stat__has_the_time_of_a_store_that_names_it_otherwise(tmp_path):
+    file = RemotePath("memory://bucket/there.tif")
+    (tmp_path / "new").write_bytes(b"0123456789")
+    file.upload(tmp_path / "new")
+    assert abs(file.stat().st_mtime - (tmp_path / "new").stat().st_mtime) < PATIENCE
+    assert (file.is_file(), file.is_dir(), file.parent.is_dir(), file.parent.stat().st_mtime) == (True, False, True, 0)
+    with file.open() as stream:
+        assert (stream.seek(7), stream.read(), stream.tell()) == (7, b"789", 10)
+    with pytest.raises(OSError, match="not opened as 'w'"):
+        file.open("w")
+
+
 @pytest.mark.parametrize(
     ("store", "says"),
     [
@@ -204,9 +217,9 @@ def test_surface__from_bucket_to_bucket_gives_the_bytes_of_a_local_run_though_a_
     assert_same(out, tmp_path / "out", *names)
     assert sorted(objects(out)) == sorted([*names, "dsm.tif", "geometry.json", "rectify.json", "run.json"])
     np.testing.assert_array_equal(read_layers(f"{out}/dsm.tif"), read_layers(tmp_path / "out" / "dsm.tif"))
-    for name in ("status", "stac", "project", "report"):
+    for name in ("status", "plot", "stac", "project", "report"):
         assert invoke(name, out).exit_code == 0
-    assert {"stac.json", "project.qgz", "width.vrt", "report.html"} <= objects(out).keys()
+    assert {"overview.png", "stac.json", "project.qgz", "width.vrt", "report.html"} <= objects(out).keys()
     known = open_dataset(out)["disparity"].notnull().sum(), open_surface(f"{out}/dsm.tif")["height"].notnull().sum()
     assert all(known)
 
@@ -214,9 +227,9 @@ def test_surface__from_bucket_to_bucket_gives_the_bytes_of_a_local_run_though_a_
 def test_surface__of_many_in_a_bucket_has_the_bytes_of_a_local_folder(bucket, tmp_path):
     images, _ = write_views(tmp_path, 120, 130, 3, 1)
     urls = upload(tmp_path, f"{bucket}/many")[: len(images)]
-    surface(urls, tmp_path / "out", resolution=0.5, ortho=True)
+    surface(urls, tmp_path / "out", resolution=0.5, choices=SurfaceChoices(ortho=True))
     spread = {"preset": "many", "tiles": {"size": 64}, "cluster": {"kind": "processes", "workers": 2}}
-    surface(urls, f"{bucket}/many-out", spread, resolution=0.5, ortho=True)
+    surface(urls, f"{bucket}/many-out", spread, resolution=0.5, choices=SurfaceChoices(ortho=True))
     assert_same(f"{bucket}/many-out", tmp_path / "out", "dsm.tif", "ortho.tif", "validity.tif")
     assert sorted(objects(f"{bucket}/many-out")) == ["dsm.tif", "ortho.tif", "run.json", "validity.tif"]
 
@@ -240,12 +253,19 @@ def test_read_model__finds_those_of_images_in_a_bucket(bucket, tmp_path):
     np.testing.assert_array_equal(read_model(url).inverse_loc(*place), expected)
 
 
-def test_match__publishes_nothing_while_the_server_is_away_and_resumes(bucket, pair, monkeypatch):
+def test_match__publishes_whole_files_alone_while_the_server_is_away_and_resumes(bucket, pair, monkeypatch):
     out = f"{bucket}/away"
     command = [COMMAND, "match", pair / "left.tif", pair / "right.tif", out, "--config", pair / "settings.yaml"]
     for name, value in AT_ONCE.items():
         monkeypatch.setenv(name, value)
-    for request in ("/tiles/1_1.npz", "/parts/0_0.npz", "PUT /bucket/away/intervals.tif"):
+    requests = {
+        "/tiles/1_1.npz": set(),
+        "/parts/0_0.npz": set(),
+        "PUT /bucket/away/intervals.tif": set(),
+        "PUT /bucket/away/validity.tif": {"intervals.tif"},
+        "GET /bucket/away/intervals.tif": {"intervals.tif"},  # compared with the new one
+    }
+    for request, kept in requests.items():
         with away_from(request) as address, monkeypatch.context() as patch:
             patch.setenv("AWS_ENDPOINT_URL", address)
             ended = subprocess.run(
@@ -253,7 +273,7 @@ def test_match__publishes_nothing_while_the_server_is_away_and_resumes(bucket, p
             )
         assert (ended.returncode, ended.stdout, ended.stderr.count("\n")) == (1, "", 1), ended.stderr
         assert "rerun the same command: it resumes" in ended.stderr
-        assert contents(out) == {}
+        assert contents(out).keys() == kept
     done = records(out)
     assert len(done) == TILES
     subprocess.run([*command, "--quiet", "--keep-tiles"], check=True)
@@ -269,6 +289,9 @@ def test_match__treats_files_in_a_bucket_like_those_on_a_disk(bucket, pair, tmp_
     assert contents(out) == {"intervals.tif": b"the user's"}
     assert invoke(*command, "--overwrite").exit_code == 0
     assert_same(out, pair / "undisturbed", *RASTERS)
+    assert invoke("evaluate", out, "--truth", pair / "truth.tif").exit_code == 0
+    assert [str(file) for file in export(out, "s2p", f"{out}/s2p")][:1] == [f"{out}/s2p/rectified_disp.tif"]
+    assert "s2p/rectified_mask.png" in objects(out)
     refused([*command, "--set", "median.size=5"], f"{out} already holds another run: settings.median")
     assert "already complete" in invoke(*command).stderr
     upload(pair / "undisturbed", f"{bucket}/inside")
