@@ -9,6 +9,7 @@ from sat_intervals.config import Config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.ortho import ortho
 from sat_intervals.heights.shifts import Sample
+from sat_intervals.kernels.components import component_sizes
 from sat_intervals.kernels.disparity import median
 from sat_intervals.match.ground import BLOCK, GroundViews
 from sat_intervals.match.local_ranges import LocalRanges
@@ -27,10 +28,11 @@ except ModuleNotFoundError as error:
 # Cells of a tile of a level, and around it that support it.
 _TILE, _OVERLAP = 256, 16
 # Share of the cells of a level, of lowest confidence, that neither ranges nor shifts are made of.
-_UNSURE = 0.1, 0.3
+_UNSURE = 0.02, 0.3
 # Cells of a level around a block of the next one that its range is made of, and the margin of the range: steps of the
-# level, and a share of the range.
-_BESIDE, _MARGIN = 4, (2, 0.1)
+# level, and a share of the range. With 4 cells whole roofs were lost that end beyond a block.
+_BESIDE, _MARGIN = 16, (2, 0.1)
+_SPECKLE = 30  # cells of a level of one surface, at least, that ranges are made of: fewer are stray winners
 # Sample blocks for shifts along each side of the grid, of the cells and of coarse levels, and their side in cells.
 _SAMPLES, _SIDE = (3, 2), 96
 # Cells over which grey values are made alike.
@@ -117,6 +119,7 @@ def ranges_for(surface: Surface, stack: Stack, finer: Stack, factor: int) -> Loc
     Blocks that no two images show have one height.
     """
     sure = surface.sure(_UNSURE[0])
+    sure &= component_sizes(surface.disparity, sure) >= _SPECKLE
     disparity = median(surface.disparity, sure, 3)
     rows, columns = (-(-size // BLOCK) for size in finer.ground.shape)
     least, most = np.full((2, rows, columns), np.nan)
