@@ -660,10 +660,9 @@ def test_commands__are_guessed_at():
 
 
 @pytest.mark.peer("shareloc")
-@pytest.mark.parametrize("command", ["triangulate", "dsm", "export", "evaluate", "calibrate", "reference"])
+@pytest.mark.parametrize("command", ["triangulate", "export", "evaluate", "calibrate", "reference"])
 def test_commands_of_a_pair__refuse_a_run_of_many_images(command, swept, tmp_path):
     options = {
-        "dsm": ["--resolution", 1, "--output", tmp_path / "dsm.tif"],
         "export": [tmp_path / "to", "--to", "otb"],
         "calibrate": ["--output", tmp_path / "calibration.yaml"],
         "reference": ["--heights", swept / "dsm.tif", "--ellipsoid"],
