@@ -39,7 +39,7 @@ def aligned(
     """Move the points of runs onto each other, or onto a raster of reference heights.
 
     Also return the shift of each run, easting, northing and height in metres, with its ``deviation``, None if unknown.
-    Raises `SatIntervalsError` for a run that has no ground with the reference.
+    Raises `SatIntervalsError` for a run that has no ground with the reference, or is far from it.
     """
     count = len(clouds) + bool(reference)
     heights_only = [PointCloud(one.run, one.ground.lattice, replace(one.choices, bounds="envelope")) for one in clouds]

@@ -126,12 +126,11 @@ def _surface(run: Run) -> Iterator[ProjectLayer]:
     yield ProjectLayer(group, "half width", "half the width of the height's interval, m", half, wide, True)
     yield ProjectLayer(group, "confidence of heights", meanings["confidence"], surface, styles.shares(5))
     ramp = styles.colours(1, height, styles.VIRIDIS, unit="m")
-    yield ProjectLayer(group, _HEIGHT, meanings["height"], surface, ramp, True, not run.ortho, _MULTIPLY)
-    if run.ortho:
-        grey = styles.grey(1, read_small_layers(run.ortho, _fitting(shape))[0])
-        yield ProjectLayer(
-            group, "ortho-image", "image on the surface", Raster(run.ortho, place, shape), grey, True, True
-        )
+    ortho = run.ortho
+    yield ProjectLayer(group, _HEIGHT, meanings["height"], surface, ramp, True, not ortho, _MULTIPLY)
+    if ortho:
+        grey = styles.grey(1, read_small_layers(ortho, _fitting(shape))[0])
+        yield ProjectLayer(group, "ortho-image", "image on the surface", Raster(ortho, place, shape), grey, True, True)
     yield ProjectLayer(group, "hillshade", "shaded heights", surface, styles.hillshade(1), is_shown=True)
 
 
