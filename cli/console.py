@@ -31,6 +31,8 @@ STAGES = {
     "points": "triangulating rows",
     "geometry": "reading models and grids",
     "resampling": "resampling rows",
+    "extent": "finding the extent of the points",
+    "alignment": "comparing runs",
     "cells": "filling rows of cells",
     "fill": "filling voids",
     "change": "comparing rows of cells",

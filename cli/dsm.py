@@ -10,6 +10,7 @@ import click
 
 from sat_intervals.cli import options
 from sat_intervals.cli.logs import warn
+from sat_intervals.cli.matching import SettingsArguments, cluster_options
 from sat_intervals.cli.triangulate import say_geometry
 
 if TYPE_CHECKING:
@@ -175,6 +176,7 @@ def say_surface(console: "Console", report: dict[str, Any]) -> None:
     "--reference", type=options.FILE, help="Raster of heights, above the same datum, that each OUT is moved onto."
 )
 @click.option("--output", type=options.FILE, help="File to write; default dsm.tif in the first OUT.")
+@cluster_options
 @options.overwrite_option
 @options.sensor_options
 @options.printing_options
@@ -184,6 +186,7 @@ def dsm(
     aligns: bool,
     reference: Path | None,
     output: Path | None,
+    settings: SettingsArguments,
     overwrite: bool,
     sensor_files: list[options.SensorFiles],
     printing: options.Printing,
@@ -209,9 +212,9 @@ def dsm(
     hull.
     """
     from sat_intervals.cli.console import say_completed
-    from sat_intervals.heights.dsm import make_surface
     from sat_intervals.raster.publishing import check_free
     from sat_intervals.run.status import runs_of
+    from sat_intervals.workflows.dsm import make_surface
 
     choices = replace(cells["choices"], aligns=aligns, reference=reference)
     if choices.ortho and output:
@@ -220,7 +223,8 @@ def dsm(
     outs = tuple(run for out in outs for run in runs_of(out))
     with printing.console() as console:
         options.note_geometry(outs, sensor_files)
-        report = make_surface(outs, output, **(cells | {"choices": choices}), progress=console.progress)
+        cells |= {"choices": choices, "config": settings.load()}
+        report = make_surface(outs, output, **cells, progress=console.progress)
     printing.say(report)
     if "geometry" in report:
         say_surface(console, report)

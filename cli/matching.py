@@ -89,8 +89,17 @@ _LEVEL_OPTIONS = (
     click.option("--calibration", type=NAME, help="Calibration for --coverage; default the built-in one."),
     expert_option("--alpha", type=float, metavar="A", help="Level of possibility, above 0 to 1; no coverage."),
 )
-_FIRST_SETTINGS = (
+_CLUSTER_OPTIONS = (
     click.option("--config", "config_file", type=FILE, help="Settings (YAML); the command line wins."),
+    click.option("--workers", type=click.IntRange(min=1), help="Tiles at once; default one per core."),
+    expert_option(
+        "--cluster",
+        metavar="SPEC",
+        help="threads (default), processes, slurm, pbs, lsf, sge, or the address of a dask scheduler.",
+    ),
+)
+_FIRST_SETTINGS = (
+    _CLUSTER_OPTIONS[0],
     click.option(
         "--preset",
         type=click.Choice(PRESETS),
@@ -103,12 +112,7 @@ _LAST_SETTINGS = (
         "--rows", type=click.Choice(("auto", "none")), help="Row offsets of the right image: taken out, or left."
     ),
     expert_option("--tile-size", type=int, help="Side of a tile's core in pixels, a multiple of 64."),
-    click.option("--workers", type=click.IntRange(min=1), help="Tiles at once; default one per core."),
-    expert_option(
-        "--cluster",
-        metavar="SPEC",
-        help="threads (default), processes, slurm, pbs, lsf, sge, or the address of a dask scheduler.",
-    ),
+    *_CLUSTER_OPTIONS[1:],
     expert_option(
         "--set", "named", multiple=True, metavar="KEY=VALUE", help="Any other setting, such as tiles.overlap=100."
     ),
@@ -125,6 +129,25 @@ _PLACES = {
 }
 
 
+def _clustered(*, config_file: Path | None, workers: int | None, cluster: str | None) -> SettingsArguments:
+    sections: dict[str, Any] = {}
+    _put(sections, "--workers", **{"cluster.workers": workers})
+    _put_cluster(sections, cluster)
+    return SettingsArguments(config_file, sections)
+
+
+def cluster_options(command: Command) -> Command:
+    """Add options for the workers alone; the command gets ``settings``."""
+    return gathered("settings", _clustered, *_CLUSTER_OPTIONS)(command)
+
+
+def _put_cluster(sections: dict[str, Any], cluster: str | None) -> None:
+    if cluster:
+        is_address = "://" in cluster
+        chosen = {"kind": "address", "address": cluster} if is_address else {"kind": cluster}
+        _put(sections, "--cluster", **{f"cluster.{key}": value for key, value in chosen.items()})
+
+
 def settings_options(command: Command, *, levels: bool = True) -> Command:
     """Add options for settings; ``levels``: also --coverage, --calibration and --alpha."""
 
@@ -139,10 +162,7 @@ def settings_options(command: Command, *, levels: bool = True) -> Command:
         _put(sections, "--preset", preset=preset)
         for name, key in places.items():
             _put(sections, f"--{name.replace('_', '-')}", **{key: values[name]})
-        if cluster:
-            is_address = "://" in cluster
-            chosen = {"kind": "address", "address": cluster} if is_address else {"kind": cluster}
-            _put(sections, "--cluster", **{f"cluster.{key}": value for key, value in chosen.items()})
+        _put_cluster(sections, cluster)
         options = tuple(f"--{name.replace('_', '-')}" for name, value in given.items() if value is not None)
         return command(settings=SettingsArguments(config_file, sections, options), **others)
 

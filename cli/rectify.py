@@ -8,6 +8,7 @@ import click
 from sat_intervals.cli import options
 from sat_intervals.cli.images import PairArguments, image_options
 from sat_intervals.cli.logs import warn
+from sat_intervals.cli.matching import SettingsArguments, cluster_options
 
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
@@ -44,9 +45,17 @@ def raw_options(command: options.Command) -> options.Command:
 @click.option("--right-model", type=options.FILE, help="RPC model of the right image.")
 @raw_options
 @click.option("--geoid", type=options.FILE, help="Geoid grid that heights of --dem refer to; default the ellipsoid.")
+@cluster_options
 @options.overwrite_option
 @options.printing_options
-def rectify(pair: PairArguments, out: Path, raw: dict[str, Any], printing: options.Printing, **more: Any) -> None:
+def rectify(
+    pair: PairArguments,
+    out: Path,
+    raw: dict[str, Any],
+    settings: SettingsArguments,
+    printing: options.Printing,
+    **more: Any,
+) -> None:
     """Resample the raw images LEFT and RIGHT, with RPC models, to an epipolar pair in the folder OUT.
 
     \b
@@ -64,7 +73,7 @@ def rectify(pair: PairArguments, out: Path, raw: dict[str, Any], printing: optio
 
     left, right = pair.open()
     with printing.console() as console:
-        record = rectify(left, right, out, **raw, **more, progress=console.progress)
+        record = rectify(left, right, out, **raw, **more, config=settings.load(), progress=console.progress)
         say_rectified(console, record)
     printing.say(record)
     for name in ("left.tif", "right.tif", "left_grid.tif", "right_grid.tif", "rectify.json"):

@@ -15,7 +15,6 @@ if typing.TYPE_CHECKING:
     from sat_intervals.evaluate.surface_accuracy import evaluate_surface
     from sat_intervals.evaluate.surface_calibration import calibrate_surface
     from sat_intervals.heights.choices import SurfaceChoices
-    from sat_intervals.heights.dsm import make_surface
     from sat_intervals.heights.geometry import set_geometry
     from sat_intervals.heights.triangulate import triangulate
     from sat_intervals.interop.dataset import decode_flags, open, open_surface
@@ -27,6 +26,7 @@ if typing.TYPE_CHECKING:
     from sat_intervals.tiling import Window
     from sat_intervals.workflows.calibrate import calibrate
     from sat_intervals.workflows.change import change
+    from sat_intervals.workflows.dsm import make_surface
     from sat_intervals.workflows.rectify import rectify
     from sat_intervals.workflows.surface import surface
 
@@ -58,7 +58,7 @@ _HOMES = {
     "intervals_of": "match.volumes",
     "load_config": "config",
     "load_height_calibration": "config",
-    "make_surface": "heights.dsm",
+    "make_surface": "workflows.dsm",
     "match_arrays": "prepare.in_memory",
     "match_pair": "run.pair",
     "open": "interop.dataset",

@@ -56,6 +56,7 @@ OVER_THE_LIMITS = {
     "sat_intervals.run.pair.match_pair": "what a run takes, with a matcher of one's own",
     "sat_intervals.workflows.calibrate.calibrate": "how pairs are matched and compared with their truth, by name",
     "sat_intervals.workflows.change.change": "what is compared and at which rate, by name",
+    "sat_intervals.workflows.dsm.make_surface": "what a surface of runs takes, by name",
     "sat_intervals.workflows.rectify.rectify": "what raw images need, by name",
     "sat_intervals.workflows.surface.surface": "what the steps of both ways take, by name",
 }

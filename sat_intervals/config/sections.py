@@ -209,7 +209,7 @@ class Tiles(Section):
 
 
 class Cluster(Section):
-    """Where tiles are matched; no effect on the results."""
+    """Where the work is done; no effect on the results."""
 
     kind: Literal["threads", "processes", "address", "slurm", "pbs", "lsf", "sge"] = Field(
         "threads", description="of this machine, an existing scheduler, or jobs of a batch system"

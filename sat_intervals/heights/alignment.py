@@ -4,9 +4,7 @@ Models of images are off by a pixel or so, and surfaces of their pairs by as muc
 blocks of ground that both have; least squares over all these shifts give one of each run, with mean 0.
 """
 
-import threading
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -18,6 +16,7 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.point_cloud import Cells, PointCloud
 from sat_intervals.kernels.gridding import mean_heights
 from sat_intervals.kernels.registration import REACH, Registration, part_of, put_together, register, spread_blocks
+from sat_intervals.prepare.pair import Each
 from sat_intervals.raster import is_ground, north_up, read_heights
 from sat_intervals.tiling import Window
 
@@ -29,7 +28,7 @@ _LEAST, _FAR = 0.01, 500.0  # metres: least deviation of a shift; largest differ
 
 
 def aligned(
-    threads: ThreadPoolExecutor,
+    each: Each,
     clouds: Sequence[PointCloud],
     cells: Cells,
     crs: str,
@@ -43,12 +42,17 @@ def aligned(
     """
     count = len(clouds) + bool(reference)
     heights_only = [PointCloud(one.run, one.ground.lattice, replace(one.choices, bounds="envelope")) for one in clouds]
-    found = dict[tuple[int, int], list[tuple[np.ndarray, ...]]]()
     cores = spread_blocks(Window(0, 0, cells.rows, cells.columns), _SMALLEST)
-    for heights in threads.map(lambda core: list(_heights(heights_only, cells, crs, radius, reference, core)), cores):
-        for one, other in combinations(range(count), 2):
-            inner = heights[other][REACH + 1 : -REACH - 1, REACH + 1 : -REACH - 1]
-            found.setdefault((one, other), []).append(part_of(heights[one], inner))
+    arguments = []
+    for core in cores:
+        around = core.grown(REACH + 1, REACH + 1)
+        extent = cells.extent(around).grown(radius)
+        arguments.append(([one.near(extent) for one in heights_only], cells, crs, radius, reference, around))
+    blocks = dict(each(_parts, arguments, "alignment"))
+    found = {
+        pair: [blocks[number][place] for number in range(len(cores))]
+        for place, pair in enumerate(combinations(range(count), 2))
+    }
     pairs = {pair: register(put_together(parts, cells.resolution, moves=-1)) for pair, parts in found.items()}
     known = {pair: one for pair, one in pairs.items() if one}
     shifts, deviations = solved(known, count, has_reference=bool(reference))
@@ -68,19 +72,19 @@ def aligned(
     return moved, report
 
 
-def _heights(
-    clouds: Sequence[PointCloud], cells: Cells, crs: str, radius: float, reference: Path | None, core: Window
-) -> Iterator[np.ndarray]:
-    """Yield the heights of each run and of the reference on a block and around it: ``(rows, columns)``, NaN if none."""
-    around = core.grown(REACH + 1, REACH + 1)
-    for cloud in clouds:
-        heights = mean_heights(cloud.splat(cells, around, radius, threading.Event())[0])
-        yield heights.astype(np.float32)  # those of all blocks are kept
+def _parts(
+    clouds: Sequence[PointCloud], cells: Cells, crs: str, radius: float, reference: Path | None, around: Window
+) -> list[tuple[np.ndarray, ...]]:
+    """Return what registers each two of all runs and the reference on a block and around it; runs on a worker."""
+    # float32, since those of all blocks are kept; NaN where there is no height
+    heights = [mean_heights(cloud.splat(cells, around, radius)[0]).astype(np.float32) for cloud in clouds]
     if reference:
         place = north_up(crs, cells.left, cells.top, cells.resolution).shifted(around)
         shape = around.height, around.width
-        heights = read_heights(reference, place, shape, Window(0, 0, *shape), smooth=True)
-        yield np.where(is_ground(heights), heights, np.nan).astype(np.float32)
+        known = read_heights(reference, place, shape, Window(0, 0, *shape), smooth=True)
+        heights.append(np.where(is_ground(known), known, np.nan).astype(np.float32))
+    inner = slice(REACH + 1, -REACH - 1)
+    return [part_of(one, other[inner, inner]) for one, other in combinations(heights, 2)]
 
 
 def solved(

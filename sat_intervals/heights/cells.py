@@ -1,105 +1,90 @@
-"""Make the cells of a surface model strip by strip, each tile from the points near it of all runs, and count them."""
+"""Make the cells of a surface model, each tile of some rows from the points near it of all runs, and count them."""
 
 import math
-import threading
-from collections import Counter, deque
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from sat_intervals.config import HeightCalibration
 from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.point_cloud import Cells, PointCloud
 from sat_intervals.kernels.conformal import AROUND, Margins, outwards, relief_of
 from sat_intervals.kernels.gridding import BOUNDED, CONFIDENCE, COUNT, HEIGHT, LOWER, UPPER, WEIGHT
-from sat_intervals.match.histogram import Histogram
+from sat_intervals.match.histogram import quantile
+from sat_intervals.prepare.pair import Rows
 from sat_intervals.products import SURFACE
 from sat_intervals.tiling import Window, strips_of_windows
 
-_TILE = 1024  # side of a tile in cells: some hundred megabytes
-# Cells of a strip of tiles, 24 bytes each, a few strips in memory; tiles of wide surfaces have fewer rows.
-_STRIP_CELLS, _LOWEST = 1 << 21, 64
+_TILE = 1024  # largest side of a tile in cells: some hundred megabytes
 _LISTED = 1 << 24  # bounds listed for the quantiles of a tile: 4 bytes each
 _STEPS, _WIDEST = 50, 1000  # widths are counted in steps of 2 cm, up to so many metres
 # Share of the weights below the height of runs that are apart; cells between heights that are.
 _LOW, _APART = 1 / 3, 2.0
 _NARROWEST = 0.01  # metres: narrower intervals weigh as much as one of this width
-Strip = tuple[int, np.ndarray, Counter[str]]  # see `strips`
 WIDE = 20.0  # metres: half widths from this on are reported as a share
 
-
-def strips(
-    threads: ThreadPoolExecutor, clouds: Sequence[PointCloud], cells: Cells, radius: float, choices: SurfaceChoices
-) -> Iterator[Strip]:
-    """Yield first row, bands of SURFACE ``(6, rows, columns)``, and counts of full-width strips from the top."""
-    parts = _strips(threads, clouds, cells, radius, choices)
-    for row, bands, counts in parts if choices.calibration is None else _calibrated(parts, choices.calibration):
-        counts["poor_cells"] += without_poor_cells(bands, choices.max_width, None)
-        yield row, bands, counts
+Tile = tuple[Window, list[PointCloud]]
+"""A window of cells, and the points near it of each run."""
 
 
-def _calibrated(parts: Iterator[Strip], calibration: HeightCalibration) -> Iterator[Strip]:
-    """Yield strips with calibrated intervals, which depend on the heights of two rows above and below."""
-    strip: Strip | None = next(parts)
-    margins = Margins(*calibration.table())
-    above = np.empty((0, 0), np.float32)
-    while strip is not None:
-        following = next(parts, None)
-        heights = strip[1][0]
-        near = [above] * bool(above.size) + [heights] + ([following[1][0, :AROUND]] if following else [])
-        relief = relief_of(np.concatenate(near))[len(above) :][: len(heights)]
-        above = heights[-AROUND:].copy()
-        height, lower, upper = strip[1][:3]
-        strip[1][1:3] = margins.widened(height, lower, upper, relief)
-        yield strip
-        strip = following
+@dataclass(frozen=True)
+class Gridding:
+    """Points of runs, the cells that they fill, their reach in metres, and how."""
+
+    clouds: Sequence[PointCloud]
+    cells: Cells
+    radius: float
+    choices: SurfaceChoices
+
+    def arguments(self, rows: Window) -> tuple[Any, ...]:
+        """Return what `rows_of_cells` needs for some rows."""
+        cells, margin = self.cells, AROUND if self.choices.calibration else 0
+        around = rows.grown(margin, 0).clipped(Window(0, 0, cells.rows, cells.columns))
+        tiles = []
+        for windows in strips_of_windows((around.height, around.width), *self._tile_size(around)):
+            for window in (replace(one, row=around.row + one.row) for one in windows):
+                extent = cells.extent(window).grown(self.radius)
+                tiles.append((window, [cloud.near(extent) for cloud in self.clouds]))
+        return rows, around, tiles, replace(self, clouds=())
+
+    def _tile_size(self, around: Window) -> tuple[int, int]:
+        """Return rows and columns of a tile: as large as memory allows, all of the same size."""
+        rows, columns = min(around.height, _TILE), _TILE
+        if self.choices.bounds == "quantiles":
+            side = self.cells.resolution
+            reaching = max(1.0, math.pi * (self.radius / side) ** 2)  # cells that a point reaches
+            most = _LISTED / reaching * min(cloud.ground.pixel_area for cloud in self.clouds) / side**2
+            rows = max(1, min(rows, int(math.sqrt(most))))
+            columns = max(1, min(columns, int(most / rows)))
+        # equal parts
+        rows, columns = (
+            -(-whole // -(-whole // most)) for whole, most in ((around.height, rows), (around.width, columns))
+        )
+        return rows, columns
 
 
-def _strips(
-    threads: ThreadPoolExecutor, clouds: Sequence[PointCloud], cells: Cells, radius: float, choices: SurfaceChoices
-) -> Iterator[Strip]:
-    """Yield strips without a calibration, and with intervals of any width."""
-    ended = threading.Event()
+def rows_of_cells(rows: Window, around: Window, tiles: Sequence[Tile], how: Gridding) -> Rows:
+    """Return the bands of SURFACE of some rows, and what `counted` notes of them; runs on a worker.
 
-    def tile(window: Window) -> tuple[np.ndarray, Counter[str]]:
-        gathered, counts = zip(*(cloud.splat(cells, window, radius, ended) for cloud in clouds), strict=True)
-        bands = fused(gathered, _APART * cells.resolution)
-        poor = without_poor_cells(bands, None, choices.min_confidence)
-        return bands, sum(counts, Counter(poor_cells=poor))
-
-    rows, columns = _tile_size(clouds, cells, radius, choices)
-    running: deque[tuple[int, list[Future[tuple[np.ndarray, Counter[str]]]]]] = deque()
-
-    def finished() -> Strip:
-        row, tiles = running.popleft()
-        bands, counts = zip(*(future.result() for future in tiles), strict=True)
-        return row, np.concatenate(bands, axis=2), sum(counts, Counter())
-
-    try:
-        for windows in strips_of_windows((cells.rows, cells.columns), rows, columns):
-            running.append((windows[0].row, [threads.submit(tile, window) for window in windows]))
-            if len(running) > 1:  # the next strip is computed while this one is written
-                yield finished()
-        yield finished()
-    except BaseException:  # the running tiles end, too
-        ended.set()
-        threads.shutdown(wait=False, cancel_futures=True)
-        raise
-
-
-def _tile_size(clouds: Sequence[PointCloud], cells: Cells, radius: float, choices: SurfaceChoices) -> tuple[int, int]:
-    """Return rows and columns of a tile: as large as memory allows, all of the same size."""
-    rows, columns = min(_TILE, max(_LOWEST, _STRIP_CELLS // cells.columns)), _TILE
-    if choices.bounds == "quantiles":
-        reaching = max(1.0, math.pi * (radius / cells.resolution) ** 2)  # cells that a point reaches
-        most = _LISTED / reaching * min(cloud.ground.pixel_area for cloud in clouds) / cells.resolution**2
-        rows = max(AROUND, min(rows, int(math.sqrt(most))))
-        columns = max(1, min(columns, int(most / rows)))
-    # equal parts
-    rows, columns = (-(-whole // -(-whole // most)) for whole, most in ((cells.rows, rows), (cells.columns, columns)))
-    return rows, columns
+    ``around``: the rows with those that their calibration needs, which ``tiles`` fill.
+    """
+    counts, choices = Counter[str](), how.choices
+    bands = np.empty((len(SURFACE), around.height, around.width), np.float32)
+    for window, clouds in tiles:
+        gathered, found = zip(*(cloud.splat(how.cells, window, how.radius, rows) for cloud in clouds), strict=True)
+        bands[:, *window.relative_to(around).slices] = fused(gathered, _APART * how.cells.resolution)
+        counts = sum(found, counts)
+    made = bands[:, *rows.relative_to(around).slices]
+    measured = np.isfinite(made[0]).sum()
+    remove_poor_cells(bands, None, choices.min_confidence)
+    if choices.calibration:
+        height, lower, upper = bands[:3]
+        bands[1:3] = Margins(*choices.calibration.table()).widened(height, lower, upper, relief_of(height))
+    remove_poor_cells(bands, choices.max_width, None)
+    counts["poor_cells"] = int(measured - np.isfinite(made[0]).sum())
+    return [made], counted(made, counts)
 
 
 def fused(gathered: Sequence[np.ndarray], apart: float) -> np.ndarray:
@@ -159,47 +144,42 @@ def _mean(weights: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.asarray(np.nansum(weights * values, axis=0) / total)
 
 
-def without_poor_cells(bands: np.ndarray, max_width: float | None, min_confidence: float | None) -> int:
-    """Set the cells of wider intervals or lower confidence to NaN, in place; return their number."""
+def remove_poor_cells(bands: np.ndarray, max_width: float | None, min_confidence: float | None) -> None:
+    """Set the cells of wider intervals or lower confidence to NaN, in place."""
     height, lower, upper, _, confidence, _ = bands
     poor = np.zeros(height.shape, np.bool_)
     if max_width is not None:
         poor |= ~(upper - lower <= max_width)
     if min_confidence is not None:
         poor |= ~(confidence >= min_confidence)
-    poor &= np.isfinite(height)
     bands[:, poor] = np.nan
-    return int(poor.sum())
 
 
-class CellCounts:
-    """Count the cells of a surface, and their widths."""
+def counted(bands: np.ndarray, counts: Counter[str]) -> dict[str, Any]:
+    """Return numbers of cells beside ``counts`` of their points, and numbers of their widths in steps."""
+    height, lower, upper, *_, agreement = bands
+    width = upper - lower
+    width = width[np.isfinite(width)]
+    known = {"filled": np.isfinite(height), "shared": np.isfinite(agreement), "disagreeing": agreement == 0}
+    known |= {"bounded": np.isfinite(width), "wide": width >= 2 * WIDE}
+    steps = np.bincount(np.clip(np.rint(width * _STEPS), 0, _WIDEST * _STEPS).astype(np.int64))
+    found = np.flatnonzero(steps).tolist()
+    widths = dict(zip(map(str, found), steps[found].tolist(), strict=True))
+    return {"counts": counts | {name: int(np.count_nonzero(of)) for name, of in known.items()}, "widths": widths}
 
-    def __init__(self) -> None:
-        self._counts = Counter[str]()
-        self._filled = self._shared = self._disagreeing = self._bounded = self._wide = 0
-        self._widths = Histogram(0, _WIDEST, _STEPS)
 
-    def add(self, bands: np.ndarray, counts: Counter[str]) -> None:
-        """Add cells, and counts of their points, see `strips`."""
-        height, lower, upper, *_, agreement = bands
-        width = upper - lower
-        width = width[np.isfinite(width)]
-        self._counts += counts
-        self._filled += int(np.isfinite(height).sum())
-        self._shared += int(np.isfinite(agreement).sum())
-        self._disagreeing += int((agreement == 0).sum())
-        self._bounded += width.size
-        self._wide += int((width >= 2 * WIDE).sum())
-        self._widths.add(width)
-
-    def report(self, cells: int) -> dict[str, Any]:
-        """Return the figures, see `make_surface`, with shares of so many cells."""
-        median = self._widths.median()
-        return {
-            **{name: self._counts[name] for name in ("points", "outliers", "open", "border", "poor_cells")},
-            "filled": self._filled / cells,
-            "disagreeing": self._disagreeing / self._shared if self._shared else None,
-            "median_half_width": None if median is None else median / 2,
-            "wide": self._wide / self._bounded if self._bounded else None,
-        }
+def report_of(noted: Iterable[Mapping[str, Any]], cells: int) -> dict[str, Any]:
+    """Return the figures of a surface, see `make_surface`, with shares of so many cells, from those of `counted`."""
+    counts, widths = Counter[str](), Counter[str]()
+    for one in noted:
+        counts.update(one["counts"])
+        widths.update(one["widths"])
+    steps = np.array([*map(int, widths)], np.int64)
+    median = quantile(steps / _STEPS, np.array([*widths.values()], np.int64), 0.5)
+    return {
+        **{name: counts[name] for name in ("points", "outliers", "open", "border", "poor_cells")},
+        "filled": counts["filled"] / cells,
+        "disagreeing": counts["disagreeing"] / counts["shared"] if counts["shared"] else None,
+        "median_half_width": median / 2 if widths else None,
+        "wide": counts["wide"] / counts["bounded"] if widths else None,
+    }

@@ -1,7 +1,6 @@
 """Make a surface model with height intervals from runs; cells without a point are no data."""
 
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,14 +10,14 @@ import numpy as np
 from sat_intervals.config import Calibration, Interval
 from sat_intervals.errors import SatIntervalsError, check_absent
 from sat_intervals.heights.alignment import aligned
-from sat_intervals.heights.cells import CellCounts, Strip, strips
+from sat_intervals.heights.cells import Gridding, report_of, rows_of_cells
 from sat_intervals.heights.choices import SurfaceChoices, completion_of
 from sat_intervals.heights.geometry import FILE, Geometry, geometry_of
 from sat_intervals.heights.lattice import Extent, Ground, joined, on_map
 from sat_intervals.heights.ortho import write_ortho_of
 from sat_intervals.heights.point_cloud import Cells, PointCloud
 from sat_intervals.heights.rectify import raw_inputs
-from sat_intervals.machine import usable_cores
+from sat_intervals.prepare.pair import Each, Pool
 from sat_intervals.products import ORTHO
 from sat_intervals.progress import Progress
 from sat_intervals.raster import (
@@ -38,7 +37,7 @@ from sat_intervals.raster.georeferencing import horizontal_name
 from sat_intervals.raster.heightfield import warn_of_no_data
 from sat_intervals.raster.identity import check_not_replaced, identities
 from sat_intervals.raster.surfaces import check_level
-from sat_intervals.results import Run, open_run
+from sat_intervals.results import Run
 from sat_intervals.tiling import Window
 
 _CELLS_PER_PIXEL = 1000  # more cells per pixel mean a wrong resolution or runs of different places
@@ -46,63 +45,19 @@ _REACH = 32  # largest radius in cells: the work grows with its square
 _LARGEST = 10_000.0  # metres: largest cell and largest radius
 
 
-def make_surface(
-    outs: Sequence[str | Path | Run],
-    path: str | Path,
+def surface_of_runs(
+    runs: Sequence[Run],
+    path: Path,
+    pool: Pool,
     *,
     resolution: float | Path | None = None,
     crs: str | None = None,
     radius: float | None = None,
-    geoid: str | Path | None = None,
-    choices: SurfaceChoices | None = None,
-    progress: Progress = lambda stage, done, total: None,
+    geoid: Path | None = None,
+    choices: SurfaceChoices,
 ) -> dict[str, Any]:
-    """Make a surface model from one or several runs, or complete that of a run of many images.
-
-    Parameters
-    ----------
-    outs
-        Folders of finished runs of the same place, or runs as they were opened; `set_geometry` has named models and
-        grids of each. Or a run of three images or more alone: its surface is completed by ``choices``, which have
-        ``fill``, ``flatten`` or ``mask``.
-    path
-        The Cloud-Optimized GeoTIFF to write; an existing file is replaced.
-    resolution
-        Side of a cell in metres; or a north-up raster with square pixels, whose grid and CRS are used. None of many
-        images: their surface keeps its grid.
-    crs
-        A projected CRS in metres; by default the UTM zone of a point near the middle, or that of the raster.
-    radius
-        A point also contributes to cells whose centre is within this distance (metres); by default the side of a cell.
-    geoid
-        Grid of geoid heights; heights then refer to the geoid, by default to the WGS 84 ellipsoid.
-    choices
-        The cell's interval, and what is left out: by default nothing but, with a coverage, points whose interval is
-        open. The intervals of several runs are averaged where they meet; else their hull is taken.
-    progress
-        Callback, see `Progress`.
-
-    Returns
-    -------
-    ``crs``, ``rows``, ``columns``, ``points``, ``filled`` (share of cells with a measured height), ``disagreeing``
-    (share of the cells of several runs whose intervals do not overlap, None if there are none), ``shifts`` (of each run
-    in metres, with its standard deviation, None if unknown; empty if nothing was aligned), ``without_intervals``
-    (folders of runs without intervals); ``bounds``; ``calibration`` (its name, None without one);
-    ``median_half_width`` (metres) and ``wide``, the share of cells with bounds whose half width exceeds 20 m, both None
-    without bounds; ``outliers``, ``open``, ``border`` and ``poor_cells``, the numbers of points and cells left out;
-    ``completed``, numbers of cells ``filled``, ``flattened``, ``masked``, and ``voids`` that stay, of ``areas`` of one
-    height, and of those ``without_rim``, which are voids, None of a surface as it was measured; ``geometry``, for each
-    folder, how models and grids fit, see `set_geometry`, and ``lost``, the share of the region where they have no
-    values. Of many images only ``crs``, ``rows``, ``columns`` and ``completed``.
-
-    Raises
-    ------
-    SatIntervalsError
-        A run has no models and grids, or none that fit, no cell has a height, the CRS or the grid cannot be used, or
-        the file cannot be written.
-    """
-    path, geoid, choices = path_of(path), None if geoid is None else path_of(geoid), choices or SurfaceChoices()
-    runs = [out if isinstance(out, Run) else open_run(out) for out in outs]
+    """Make a surface model of runs, see `make_surface`."""
+    progress = pool.progress
     if len(runs) == 1 and runs[0].is_sweep:
         check_absent({"resolution": resolution, "crs": crs, "radius": radius, "geoid": geoid}, "runs of two images")
         return _completed(runs[0], path, choices, progress)
@@ -119,13 +74,11 @@ def make_surface(
     projection = Projection(crs or utm_of(*geometries[0].lattice.middle), geoid)
     projection.check(*geometries[0].lattice.middle)
     clouds = [PointCloud(one.run, on_map(one.lattice, projection, str(one.run.out)), choices) for one in geometries]
-    with ThreadPoolExecutor(usable_cores()) as threads:
-        cells, shifts = _cells(threads, clouds, resolution, radius, grid), list[dict[str, Any]]()
-        if choices.reference or (choices.aligns and len(clouds) > 1):
-            clouds, shifts = aligned(threads, clouds, cells, projection.crs, radius, choices.reference)
-            cells = _cells(threads, clouds, resolution, radius, grid)
-        parts = strips(threads, clouds, cells, radius, choices)
-        figures = _write(path, parts, cells, projection.crs, tags, completion, progress)
+    cells, shifts = _cells(pool, clouds, resolution, radius, grid), list[dict[str, Any]]()
+    if choices.reference or (choices.aligns and len(clouds) > 1):
+        clouds, shifts = aligned(pool, clouds, cells, projection.crs, radius, choices.reference)
+        cells = _cells(pool, clouds, resolution, radius, grid)
+    figures = _write(path, Gridding(clouds, cells, radius, choices), projection.crs, tags, completion, pool)
     if choices.ortho:
         write_ortho_of(runs[0], path, projection, shifts[0]["shift"] if shifts else (0, 0, 0), progress)
     return {"crs": projection.crs, "rows": cells.rows, "columns": cells.columns, **figures} | {
@@ -168,29 +121,24 @@ def _files_of(raster: float | Path | None) -> Sequence[str]:
 
 def _write(
     path: Path,
-    parts: Iterable[Strip],
-    cells: Cells,
+    gridding: Gridding,
     crs: str,
     tags: dict[str, str],
     completion: Completion | None,
-    progress: Progress,
+    pool: Pool,
 ) -> dict[str, Any]:
-    """Write the strips of a surface and complete it; return what cells have, and the numbers of `complete`."""
-    tally, place = CellCounts(), north_up(crs, cells.left, cells.top, cells.resolution)
+    """Write the cells of a surface and complete it; return what cells have, and the numbers of `complete`."""
+    cells = gridding.cells
+    place = north_up(crs, cells.left, cells.top, cells.resolution)
     file, completed = surface_file(path.name), None
     completion = completion and completion.on(place, (cells.rows, cells.columns))
     with OutputWriter(path.parent, [file], cells.rows, cells.columns, place, tags) as writer:
-        for row, bands, counts in parts:
-            tally.add(bands, counts)
-            writer.write(row, bands)
-            progress("cells", row + bands.shape[1], cells.rows)
-        progress("files", 0, 1)
+        noted = pool.write_rows(writer, rows_of_cells, gridding.arguments, "cells")
         if completion:
             made = writer.build()[file.name]
-            completed = complete(made, made, file, completion, progress)
+            completed = complete(made, made, file, completion, pool.progress)
         writer.publish()
-        progress("files", 1, 1)
-    return tally.report(cells.rows * cells.columns) | {"completed": completed}
+    return report_of(noted, cells.rows * cells.columns) | {"completed": completed}
 
 
 def _geometries(
@@ -295,11 +243,9 @@ def _grid_of(path: Path, given: str | None) -> tuple[Cells, str]:
     return Cells(place.affine.c, place.affine.f, across, rows, columns), horizontal_name(place.crs)
 
 
-def _cells(
-    threads: ThreadPoolExecutor, clouds: Sequence[PointCloud], resolution: float, radius: float, grid: Cells | None
-) -> Cells:
+def _cells(each: Each, clouds: Sequence[PointCloud], resolution: float, radius: float, grid: Cells | None) -> Cells:
     """Return the cells that the points of all runs reach, or those of a given raster."""
-    extent = joined(cloud.extent(threads) for cloud in clouds)
+    extent = joined(cloud.extent(each) for cloud in clouds)
     if extent is None:
         raise SatIntervalsError(
             f"no valid pixel in {', '.join(str(cloud.run.out) for cloud in clouds)}, or all points are left out as "

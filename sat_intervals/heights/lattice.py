@@ -58,12 +58,15 @@ class Lattice:
         Pixels between nodes along rows, columns and disparities.
     region, minimum
         Pixels of the left image from the first node to the last, and disparity of the first node.
+    first
+        Row and column of the first of ``nodes`` if they are some of them, see `within`.
     """
 
     nodes: np.ndarray
     spacing: tuple[float, float, float]
     region: Window
     minimum: float
+    first: tuple[int, int] = (0, 0)
 
     @property
     def middle(self) -> tuple[float, float]:
@@ -79,17 +82,26 @@ class Lattice:
     def around(self, window: Window) -> tuple[np.ndarray, tuple[float, float, float]]:
         """Return the nodes around a window; row, column and disparity of their first, from the window's first pixel."""
         rows, columns = self.nodes_of(window)
-        first = rows.start * self.spacing[0] - window.row, columns.start * self.spacing[1] - window.column
+        row, column = (start + one.start for start, one in zip(self.first, (rows, columns), strict=True))
+        first = row * self.spacing[0] - window.row, column * self.spacing[1] - window.column
         return self.nodes[rows, columns], (*first, self.minimum)
 
     def nodes_of(self, window: Window) -> tuple[slice, slice]:
-        """Return the rows and columns of the nodes around a window."""
+        """Return the rows and columns of the nodes around a window, of those that there are."""
         ends = (window.row, window.row_stop - 1), (window.column, window.column_stop - 1)
         rows, columns = (
-            slice(min(int(first / step), count - 2), min(int(last / step) + 2, count))
-            for (first, last), step, count in zip(ends, self.spacing, self.nodes.shape, strict=False)
+            slice(max(0, min(int(first / step) - start, count - 2)), min(int(last / step) + 2 - start, count))
+            for (first, last), step, count, start in zip(
+                ends, self.spacing, self.nodes.shape[:2], self.first, strict=False
+            )
         )
         return rows, columns
+
+    def within(self, window: Window) -> "Lattice":
+        """Return the lattice with the nodes around a window alone."""
+        rows, columns = self.nodes_of(window)
+        first = self.first[0] + rows.start, self.first[1] + columns.start
+        return replace(self, nodes=self.nodes[rows, columns], first=first)
 
 
 def on_map(lattice: Lattice, projection: Projection, name: str) -> Lattice:
@@ -137,15 +149,22 @@ class Ground:
     def windows(self, extent: Extent) -> Iterator[Window]:
         """Yield windows of pixels that contain all points of an extent, and few others."""
         reaches = np.all((self._lowest <= extent[2:]) & (self._highest >= extent[:2]), axis=2)
-        (height, width), region = self.lattice.spacing[:2], self.lattice.region
-        for tile in Grid(Window(0, 0, region.height, region.width), WINDOW):
+        region, reached = self.lattice.region, np.nonzero(reaches)
+        if not reached[0].size:
+            return
+        for tile in Grid(Window(0, 0, region.height, region.width), WINDOW).within(self._pixels(*reached)):
             rows, columns = self._blocks(tile.core)
             row, column = np.nonzero(reaches[rows, columns])
             if row.size:
-                first = int((rows.start + row.min()) * height), int((columns.start + column.min()) * width)
-                last = int((rows.start + row.max() + 1) * height), int((columns.start + column.max() + 1) * width)
-                found = Window(*first, last[0] + 1 - first[0], last[1] + 1 - first[1])
-                yield found.clipped(tile.core)
+                yield self._pixels(rows.start + row, columns.start + column).clipped(tile.core)
+
+    def _pixels(self, *blocks: np.ndarray) -> Window:
+        """Return the pixels of the region around blocks, of rows and columns that are given."""
+        places = [start + of_axis for start, of_axis in zip(self.lattice.first, blocks, strict=True)]
+        row, column = (int(axis.min() * step) for axis, step in zip(places, self.lattice.spacing, strict=False))
+        last = [int((axis.max() + 1) * step) for axis, step in zip(places, self.lattice.spacing, strict=False)]
+        region = Window(0, 0, self.lattice.region.height, self.lattice.region.width)
+        return Window(row, column, last[0] + 1 - row, last[1] + 1 - column).clipped(region)
 
     def _blocks(self, window: Window) -> tuple[slice, slice]:
         rows, columns = self.lattice.nodes_of(window)

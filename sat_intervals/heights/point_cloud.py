@@ -1,10 +1,8 @@
 """Make the points of a run window by window, and accumulate them in the cells of a surface model."""
 
 import math
-import threading
 from collections import Counter
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import groupby
 from typing import NamedTuple
@@ -15,9 +13,10 @@ from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.lattice import WINDOW, Extent, Ground, Lattice, joined
 from sat_intervals.kernels.disparity import median
 from sat_intervals.kernels.gridding import BOUNDED, LOWER, UPPER, empty_cells, gather, mean_heights, quantiles, splat
+from sat_intervals.prepare.pair import Each
 from sat_intervals.products import OPEN_ABOVE, OPEN_BELOW, RANGE_INCOMPLETE, Bands
 from sat_intervals.results import Run
-from sat_intervals.tiling import Grid, Tile, Window
+from sat_intervals.tiling import Grid, Tile, Window, hull
 
 _NEAR = 2  # pixels around a point whose median outliers are compared with
 # Points do not widen a surface that are fewer than this share of a window, or farther than so many metres, and than the
@@ -78,7 +77,15 @@ class PointCloud:
         self.run, self.ground = run, Ground(lattice)
         self.choices = choices
 
-    def extent(self, threads: ThreadPoolExecutor) -> Extent | None:
+    def near(self, extent: Extent) -> "PointCloud":
+        """Return the points of the windows that reach an extent; of a large run they are a small part."""
+        return self._of(hull([*self.ground.windows(extent)] or [Window(0, 0, 1, 1)]))
+
+    def _of(self, window: Window) -> "PointCloud":
+        around = window.grown(_NEAR, _NEAR).clipped(Window(0, 0, *self.run.shape))
+        return PointCloud(self.run, self.ground.lattice.within(around), self.choices)
+
+    def extent(self, each: Each) -> Extent | None:
         """Return the extent of the points that contribute, None without any, from the outermost windows inwards."""
         found = None
         tiles = Grid(Window(0, 0, *self.run.shape), WINDOW)
@@ -90,7 +97,8 @@ class PointCloud:
         for _, ring in groupby(sorted(tiles, key=from_the_rim), from_the_rim):
             possible = ((tile.core, self.ground.extent(tile.core)) for tile in ring)
             windows = [window for window, extent in possible if extent and not (found and found.contains(extent))]
-            found = joined([found, *threads.map(self._extent, windows)])
+            extents = each(PointCloud._extent, [(self._of(window), window) for window in windows], "extent")
+            found = joined([found, *(extent for _, extent in extents)])
         return found
 
     def _extent(self, window: Window) -> Extent | None:
@@ -105,21 +113,21 @@ class PointCloud:
         return Extent(float(x.min()), float(y.min()), float(x.max()), float(y.max())) if x.size else None
 
     def splat(
-        self, cells: Cells, window: Window, radius: float, ended: threading.Event
+        self, cells: Cells, window: Window, radius: float, rows: Window | None = None
     ) -> tuple[np.ndarray, Counter[str]]:
-        """Accumulate points in a window of cells, see `kernels.gridding`, until ``ended``; ``radius`` in metres.
+        """Accumulate points in a window of cells, see `kernels.gridding`; ``radius`` in metres.
 
-        Also return the numbers of ``points`` in these cells, and of those left out, see `_places`.
+        Also return the numbers of ``points`` in these cells, in some ``rows`` alone, and of those left out, see
+        `_places`.
         """
         gathered, counts = empty_cells(window.height, window.width), Counter[str]()
         near = []
         place, reach = cells.extent(window), radius / cells.resolution
+        first, last = (0, window.height) if rows is None else (rows.row - window.row, rows.row_stop - window.row)
         for source in self.ground.windows(place.grown(radius)):
-            if ended.is_set():
-                break
             points, left_out = self.points(source)
             column, row = (points.x - place.left) / cells.resolution, (place.top - points.y) / cells.resolution
-            inside = (column >= 0) & (column < window.width) & (row >= 0) & (row < window.height)
+            inside = (column >= 0) & (column < window.width) & (row >= max(0, first)) & (row < min(window.height, last))
             for name, mask in (("points", np.isfinite(points.height)), *left_out.items()):
                 counts[name] += int(np.count_nonzero(mask & inside))
             # positions as float32: a ten-thousandth of a cell, in half the memory

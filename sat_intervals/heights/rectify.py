@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sat_intervals.errors import ChangedInputError, SatIntervalsError, check_file
+from sat_intervals.prepare.pair import Pool
 from sat_intervals.products import Band, plain
-from sat_intervals.progress import Progress
 from sat_intervals.raster import File, Georeferencing, Image, OutputWriter, check_not_replaced, describe, path_of
 from sat_intervals.raster.identity import absolute_in, identities, identity, relative_in
 from sat_intervals.raster.publishing import check_free, write_record
@@ -53,10 +53,10 @@ class RawPair:
 def make_pair(
     pair: RawPair,
     out: Path,
+    pool: Pool,
     *,
     overwrite: bool = False,
     compare: Compare | None = None,
-    progress: Progress = lambda stage, done, total: None,
 ) -> dict[str, Any]:
     """Write images, grids and record of a pair to a folder, unless it has them, and return the record."""
     from sat_intervals.heights.models import SensorImage
@@ -64,13 +64,13 @@ def make_pair(
     pair.terrain.check()
     if rectified_files(pair.left.path, pair.right.path):
         raise SatIntervalsError(f"{pair.left.path} and {pair.right.path} are an epipolar pair already: match them")
-    progress("geometry", 0, 1)
+    pool.progress("geometry", 0, 1)
     readings = [SensorImage.readings(*one) for one in zip((pair.left, pair.right), pair.models, strict=True)]
     with locked(out):
         record = read_record(out) or {}
         asked = _asked(pair, readings[0][0], readings[1][0], record.get("inputs", {}))
         if _is_needed(out, asked, record, overwrite=overwrite):
-            record = _make(pair, readings, out, asked, progress)
+            record = _make(pair, readings, out, asked, pool)
         if compare and record["rows"] is None:
             record["rows"] = compare(*(out / name for name in IMAGES))
             _note(out, record)
@@ -78,7 +78,7 @@ def make_pair(
 
 
 def _make(
-    pair: RawPair, readings: "Sequence[Sequence[SensorImage]]", out: Path, asked: dict[str, Any], progress: Progress
+    pair: RawPair, readings: "Sequence[Sequence[SensorImage]]", out: Path, asked: dict[str, Any], pool: Pool
 ) -> dict[str, Any]:
     """Write all files; return the record."""
     from sat_intervals.heights.epipolar import epipolar_geometry, grid_place
@@ -98,7 +98,7 @@ def _make(
         OutputWriter(out, files, geometry.height, geometry.width, Georeferencing(), _TAGS) as images,
         OutputWriter(out, of_grids, rows, columns, grid_place(), _TAGS) as grids,
     ):
-        _write_images(images, (left, right), geometry, progress)
+        _write_images(images, (left, right), geometry, pool)
         grids.write(0, *(np.moveaxis(nodes[..., ::-1], -1, 0) for nodes in (geometry.left, geometry.right)))
         if changes := list(differences(asked, _asked(pair, left, right, {}))):
             raise ChangedInputError(f"an input was changed meanwhile ({'; '.join(changes)}): rerun the command")
@@ -152,18 +152,15 @@ def _is_needed(out: Path, asked: dict[str, Any], before: dict[str, Any], *, over
 
 
 def _write_images(
-    writer: OutputWriter, images: "tuple[SensorImage, SensorImage]", geometry: "Epipolar", progress: Progress
+    writer: OutputWriter, images: "tuple[SensorImage, SensorImage]", geometry: "Epipolar", pool: Pool
 ) -> None:
-    from sat_intervals.heights.resampling import Resampled, nodata_of, nodes_near, resampled_strips
+    from sat_intervals.heights.resampling import Resampled, nodata_of, nodes_near, resampled_rows
 
     resampled = [
         Resampled(one.image, nodes_near(nodes - one.origin - 0.5, one.image, scale), scale, nodata_of(one.image))
         for one, nodes, scale in zip(images, (geometry.left, geometry.right), geometry.scales, strict=True)
     ]
-    for row, strips in resampled_strips(resampled, geometry.height, geometry.width):
-        progress("resampling", row, geometry.height)
-        writer.write(row, *strips)
-    progress("resampling", geometry.height, geometry.height)
+    pool.write_rows(writer, resampled_rows, lambda rows: ([one.of_rows(rows) for one in resampled], rows), "resampling")
 
 
 def read_record(folder: Path) -> dict[str, Any] | None:

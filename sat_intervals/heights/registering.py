@@ -1,7 +1,5 @@
 """Register reference heights to the points of a run: gather blocks of both, see `kernels.registration`."""
 
-import threading
-
 import numpy as np
 
 from sat_intervals.heights.choices import SurfaceChoices
@@ -43,7 +41,7 @@ def blocks_of_points(run: Run, lattice: Lattice, places: np.ndarray, pixel: floa
     for group in np.argsort(-counts, kind="stable")[: registration.ACROSS**2]:
         x, y, height = places[numbers.ravel() == group][: registration.POINTS].T
         cells = _around(x, y, pixel)
-        gathered, _ = cloud.splat(cells, Window(0, 0, cells.rows, cells.columns), pixel, threading.Event())
+        gathered, _ = cloud.splat(cells, Window(0, 0, cells.rows, cells.columns), pixel)
         parts.append((mean_heights(gathered), *_in_cells(cells, x, y), height))
     return registration.put_together(parts, pixel, moves=-1)
 

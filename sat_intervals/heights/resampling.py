@@ -1,16 +1,15 @@
-"""Resample the images of a raw pair by strips, on all cores of this machine."""
+"""Resample the images of a raw pair, rows by rows."""
 
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sat_intervals.heights.epipolar import MARGIN, STEP
 from sat_intervals.kernels.resampling import reach, resample, resample_reduced
-from sat_intervals.machine import usable_cores
+from sat_intervals.prepare.pair import Rows
 from sat_intervals.raster import BLOCK, Image, read_window
-from sat_intervals.tiling import Window
+from sat_intervals.tiling import Window, strips_of_windows
 
 _COLUMNS = 2 * BLOCK  # columns of a tile, which is as high as a block of the files
 _FAR = 4  # nodes from the image beyond which no pixel of it is between them
@@ -24,10 +23,17 @@ class Resampled:
     nodes: np.ndarray  # (n, m, 2) rows and columns in the image, pixel centres are integers
     scale: float
     nodata: float  # of pixels without a value
+    first: int = 0  # row of the first node
+
+    def of_rows(self, rows: Window) -> "Resampled":
+        """Return what some rows need."""
+        first = (rows.row + MARGIN * STEP) // STEP
+        last = (rows.row_stop - 1 + MARGIN * STEP) // STEP + 2
+        return replace(self, nodes=self.nodes[first:last], first=first)
 
     def read(self, window: Window) -> np.ndarray:
         """Return a window of the epipolar image in the image's type."""
-        first = window.row + MARGIN * STEP, window.column + MARGIN * STEP
+        first = window.row + (MARGIN - self.first) * STEP, window.column + MARGIN * STEP
         rows, columns = (
             slice(start // STEP, (start + size - 1) // STEP + 2)
             for start, size in zip(first, (window.height, window.width), strict=True)
@@ -79,13 +85,8 @@ def stored(values: np.ndarray, dtype: str, nodata: float) -> np.ndarray:
     return values.astype(dtype)
 
 
-def resampled_strips(images: Sequence[Resampled], height: int, width: int) -> Iterator[tuple[int, list[np.ndarray]]]:
-    """Yield strips of all images with their first rows, from the top."""
-    with ThreadPoolExecutor(usable_cores()) as threads:
-        for row in range(0, height, BLOCK):
-            windows = [
-                Window(row, column, min(BLOCK, height - row), min(_COLUMNS, width - column))
-                for column in range(0, width, _COLUMNS)
-            ]
-            futures = [[threads.submit(image.read, window) for window in windows] for image in images]
-            yield row, [np.concatenate([future.result() for future in of_image], axis=1) for of_image in futures]
+def resampled_rows(images: Sequence[Resampled], rows: Window) -> Rows:
+    """Return rows of all images, see `Pool`; runs on a worker."""
+    (windows,) = strips_of_windows((rows.height, rows.width), rows.height, _COLUMNS)
+    parts = [[image.read(replace(one, row=rows.row)) for one in windows] for image in images]
+    return [np.concatenate(of_image, axis=1)[np.newaxis] for of_image in parts], {}

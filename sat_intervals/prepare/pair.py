@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -13,11 +13,38 @@ from sat_intervals.match.around import CELL, ranges_around
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.whole import cut, whole_view
 from sat_intervals.prepare.local import given_ranges
-from sat_intervals.raster import Image, read_window
+from sat_intervals.raster import Image, OutputWriter, read_window
 from sat_intervals.tiling import View, Window
 
 Each = Callable[[Callable[..., Any], Sequence[tuple[Any, ...]], str], Iterator[tuple[int, Any]]]
 """Calls a function with each of some arguments in a stage; yields results with the number of their arguments."""
+
+Rows = tuple[list[np.ndarray], dict[str, Any]]
+"""A row of blocks of files, ``(bands, rows, columns)`` of each, and what is noted of it, in JSON."""
+
+RowArguments = Callable[[Window], tuple[Any, ...]]
+"""Returns what a function needs that makes the rows of a window; all of it picklable."""
+
+
+class Pool(Protocol):
+    """Who does the work: an `Each` that also writes files."""
+
+    @property
+    def progress(self) -> Callable[[str, int, int], None]:
+        """Return the callback that it calls."""
+
+    def __call__(
+        self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], stage: str
+    ) -> Iterator[tuple[int, Any]]:
+        """See `Each`."""
+
+    def write_rows(
+        self, writer: OutputWriter, function: Callable[..., Rows], arguments: RowArguments, stage: str
+    ) -> list[dict[str, Any]]:
+        """Write all files of a writer; ``function`` makes a row of blocks from ``arguments`` of its window.
+
+        Returns what is noted of each row of blocks, from the top.
+        """
 
 
 def is_plain(image: Image) -> bool:

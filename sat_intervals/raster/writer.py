@@ -37,9 +37,9 @@ class OutputWriter:
         *,
         threads: int | None = None,
     ) -> None:
-        self._folder = path_of(folder)
+        self.folder = path_of(folder)
         self._files = {file.name: file for file in files}
-        self._shape = height, width
+        self.shape = height, width
         self._georeferencing = georeferencing
         self._tags = dict(tags)
         self._threads = threads
@@ -48,13 +48,18 @@ class OutputWriter:
         self._streams: dict[str, Stream] = {}
         self._pictures: dict[str, list[np.ndarray]] = {}  # strips
 
+    @property
+    def files(self) -> tuple[File, ...]:
+        """Return the files."""
+        return tuple(self._files.values())
+
     def __enter__(self) -> Self:
-        with failing(self._folder):
-            self._folder.mkdir(parents=True, exist_ok=True)
+        with failing(self.folder):
+            self.folder.mkdir(parents=True, exist_ok=True)
         with ExitStack() as stack:
             for name in self._files:
-                self._unfinished[name] = stack.enter_context(unfinished(self._folder / name))
-            check_space(self._folder, file_bytes([*self._files.values()], *self._shape), "files")
+                self._unfinished[name] = stack.enter_context(unfinished(self.folder / name))
+            check_space(self.folder, file_bytes([*self._files.values()], *self.shape), "files")
             self._opened = stack.pop_all()
         return self
 
@@ -64,28 +69,28 @@ class OutputWriter:
     def write(self, row: int, *rasters: np.ndarray) -> None:
         """Write the strip that begins at ``row``; one array per file, ``(bands, rows, width)`` or ``(rows, width)``."""
         if not row:  # parts, too
-            check_space(self._folder, 2 * file_bytes([*self._files.values()], *self._shape), "files")
+            check_space(self.folder, 2 * file_bytes([*self._files.values()], *self.shape), "files")
         for (name, file), raster in zip(self._files.items(), rasters, strict=True):
             bands = np.ascontiguousarray(raster.reshape(-1, *raster.shape[-2:]), file.dtype)
-            with failing(self._folder / name):
+            with failing(self.folder / name):
                 if file.driver == "PNG":
                     self._pictures.setdefault(name, []).append(bands)
                     continue
                 if name not in self._streams:
-                    self._streams[name] = Stream(file, disk_of(self._folder), self._shape, self._threads)
+                    self._streams[name] = Stream(file, disk_of(self.folder), self.shape, self._threads)
                     self._opened.callback(self._streams[name].close)
                 self._streams[name].write(row, bands)
 
     def assemble(self, name: str, levels: Sequence[Sequence[Part]], copy_parts: CopyParts) -> None:
         """Make a file of rows of blocks, see `cog.assemble`, under its temporary name."""
-        with failing(self._folder / name):
+        with failing(self.folder / name):
             made = template(self._files[name], self._georeferencing, self._tags)
-            assemble(self._unfinished[name].temporary, made, self._shape, levels, copy_parts)
+            assemble(self._unfinished[name].temporary, made, self.shape, levels, copy_parts)
 
     def build(self) -> dict[str, Path]:
         """Finish all files under their temporary names, and return these by name."""
         for name, stream in self._streams.items():
-            with failing(self._folder / name):
+            with failing(self.folder / name):
                 stream.check_complete()
             self.assemble(name, stream.parts, stream.copy_parts)
             stream.close()

@@ -1,13 +1,11 @@
 """Put the files of a run together from finished parts, compare its inputs, and publish."""
 
 import logging
-import os
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import closing, contextmanager, nullcontext
-from functools import partial
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from hashlib import file_digest
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
@@ -15,28 +13,18 @@ from sat_intervals.errors import REPORT, ChangedInputError, RunError, SatInterva
 from sat_intervals.match.postprocess import ConfidenceScale, confidence_scale
 from sat_intervals.products import as_json
 from sat_intervals.progress import Progress, logged_stage
-from sat_intervals.raster import OutputError, OutputWriter, Part
+from sat_intervals.raster import OutputError, OutputWriter
 from sat_intervals.raster.completion import complete
 from sat_intervals.raster.identity import absolute_in
 from sat_intervals.raster.publishing import new_file
 from sat_intervals.run.inputs import check_unchanged
 from sat_intervals.run.job import Job, remove_tiles
+from sat_intervals.run.parts import copy_parts
 from sat_intervals.run.report import report_of, tags_of
-from sat_intervals.run.state import RUN_REPORT, files_of_run
-from sat_intervals.run.strips import (
-    PartKey,
-    check_codecs,
-    damaged_parts,
-    finish_strips,
-    part_name,
-    parts_of,
-    rows_of_levels,
-)
-from sat_intervals.run.workers import Task, Threads, Workers, picklable_errors, reason, results
-from sat_intervals.store.arrays import DamagedFileError
+from sat_intervals.run.state import RUN_REPORT
+from sat_intervals.run.strips import finish_strips, parts_of
+from sat_intervals.run.workers import Workers, reason
 from sat_intervals.store.tiles import COSTS, FAILURES, PARTS, PIXELS, Tables, home_of
-
-_THREADS = 2  # that copy parts which workers cannot copy: one reads while another writes
 
 _LOG = logging.getLogger(__name__)
 _WARNINGS = logging.getLogger(REPORT)
@@ -47,21 +35,22 @@ def assemble(job: Job, workers: Workers, seconds: dict[str, float], progress: Pr
     region, tables = job.store.grid.region, job.store.tables()
     scale = scale_of(job, tables)
     with logged_stage(seconds, "bands"):
-        parts = finish_strips(job, workers, scale, progress)
-    files, place = files_of_run(job.config), job.left.georeferencing.shifted(region)
+        parts = parts_of(job)
+        made_of = finish_strips(job, parts, workers, scale, progress)
+    files, place = parts.files, job.left.georeferencing.shifted(region)
     with (
         _resumable(job),
         OutputWriter(job.out, files, region.height, region.width, place, tags_of(job)) as writer,
     ):
         with logged_stage(seconds, "files"):
-            _copy_parts(job, writer, parts, workers, progress)
+            copy_parts(parts, made_of, writer, workers if job.is_home else None, progress)
             made, completed = writer.build(), None
             if job.swept and job.swept.completion:
                 surface = made[files[0].name]
                 completed = complete(surface, surface, files[0], job.swept.completion, progress)
         with logged_stage(seconds, "inputs"):
             check_unchanged(absolute_in(job.out, job.inputs), job.images, job.config)
-        report = report_of(job, tables, scale, parts.values(), seconds)
+        report = report_of(job, tables, scale, made_of.values(), seconds)
         if completed:
             report["sweep"]["completed"] = completed
         for line in report["warnings"]:
@@ -108,63 +97,6 @@ def _resumable(job: Job) -> Iterator[None]:
         raise
     except OutputError as error:
         raise RunError(f"{error}; rerun the same command: it resumes from the tiles, which are all done") from error
-
-
-# ---- Parts -------------------------------------------------------------------------------------------------
-def _copy_parts(
-    job: Job, writer: OutputWriter, metas: Mapping[PartKey, Mapping[str, Any]], workers: Workers, progress: Progress
-) -> None:
-    """Copy the finished parts of a run into its files, on workers that share its folder, else in this process."""
-    files = files_of_run(job.config)
-    of = parts_of(job)
-    retries = job.config.cluster.retries
-    copied: list[str | None] = []
-    with nullcontext(workers) if job.is_home else closing(Threads(_THREADS)) as copiers:
-
-        def copy_parts(path: Path, parts: Iterable[tuple[int, Part]]) -> None:
-            tasks = (
-                Task(part.source, copy_part, (job, of, *part.source, path.absolute(), offset), retries)
-                for offset, part in parts
-            )
-            for _, name in results(copiers, tasks, partial(_fail, path), look):
-                copied.append(name)
-
-        def look(_: int) -> None:
-            progress("files", len(copied), len(files) * len(metas))
-
-        look(0)
-        for file in files:
-            levels = [
-                [Part(metas[level, row]["blocks"][file.kind], ((level, row), file.kind)) for row in range(count)]
-                for level, count in enumerate(rows_of_levels(job.store.grid.region))
-            ]
-            writer.assemble(file.name, levels, copy_parts)
-    if damaged := sorted({name for name in copied if name}):
-        raise damaged_parts(job, damaged)
-
-
-def _fail(path: Path, _: object, error: BaseException) -> NoReturn:
-    if isinstance(error, (OSError, SatIntervalsError)):
-        raise error
-    raise RunError(f"a part of {path} could not be copied: {reason(error)}") from error
-
-
-def copy_part(job: Job, of: str, key: PartKey, kind: str, path: Path, offset: int) -> str | None:
-    """Write a part into a file at an offset; return its name if it is damaged or missing. Runs on a worker."""
-    with picklable_errors():
-        check_codecs(job, of)
-        try:
-            with job.store.opened(PARTS, part_name(key), of) as archive:
-                content = archive[kind]
-        except DamagedFileError:
-            return part_name(key)
-        # not for reading: NFS would write whole pages, over bytes of the neighbours
-        with open(os.open(path, os.O_WRONLY), "wb") as stream:
-            stream.seek(offset)
-            stream.write(content.data)
-            stream.flush()
-            os.fsync(stream.fileno())
-    return None
 
 
 # ---- Scale of confidence -----------------------------------------------------------------------------------

@@ -11,12 +11,16 @@ from sat_intervals.run.workers import Outcome, Task, Threads, Workers, cores_of_
 
 
 class Connection(ExitStack):
-    """Workers that are started, or connected to, for the first tasks, and closed at the end; see `Workers`."""
+    """Workers that are started, or connected to, for the first tasks, and closed at the end; see `Workers`.
+
+    What is added to ``at_end`` is done after that.
+    """
 
     def __init__(self, settings: Cluster, out: Path) -> None:
         """``out`` is the folder for logs of jobs."""
         super().__init__()
-        self._settings = with_store(settings, out)
+        self.at_end = self.enter_context(ExitStack())
+        self.settings = with_store(settings, out)
         self._out = out
         self._lock = Lock()
         self._workers: Workers | None = None
@@ -28,7 +32,7 @@ class Connection(ExitStack):
         return self._workers.outcomes(tasks)
 
     def _started(self) -> Workers:
-        settings = self._settings
+        settings = self.settings
         if settings.kind == "threads":
             return self.enter_context(closing(Threads(cores_of_process(settings), readers(settings))))
         from sat_intervals.run.submit import DaskWorkers, connected

@@ -1,19 +1,41 @@
-"""Prepare pairs with workers: what `prepare` calls for each block runs on them."""
+"""Calls of many blocks, and files of many rows, on workers."""
 
+import uuid
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NoReturn
 
-from sat_intervals.errors import RunError
+from sat_intervals.config import Cluster
+from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.prepare.pair import RowArguments, Rows
 from sat_intervals.progress import Progress
-from sat_intervals.run.workers import Task, Workers, picklable_errors, reason, results
+from sat_intervals.raster import BLOCK, OutputWriter, RemotePath
+from sat_intervals.raster.publishing import check_space, file_bytes, part_bytes
+from sat_intervals.run.connection import Connection
+from sat_intervals.run.parts import PartKey, Parts, codecs_of, copy_parts, finish_parts, write_part
+from sat_intervals.run.state import with_store
+from sat_intervals.run.workers import (
+    Task,
+    Workers,
+    check_not_full,
+    computing,
+    is_remote,
+    picklable_errors,
+    reason,
+    results,
+)
+from sat_intervals.store.folder import folder_at
+from sat_intervals.store.manifest import digest
+from sat_intervals.store.tiles import NO_TILES, Store
+from sat_intervals.tiling import Window
 
 _RETRIES = 2
 
 
 @dataclass(frozen=True)
 class EachOnWorkers:
-    """Calls functions on workers, a bounded number at a time; a `prepare.pair.Each`."""
+    """Calls functions on workers, a bounded number at a time; a `prepare.pair.Each`, and a `Pool`."""
 
     workers: Workers
     progress: Progress
@@ -30,10 +52,63 @@ class EachOnWorkers:
         self.progress(stage, 0, len(arguments))
         return results(self.workers, tasks, failed, lambda done: self.progress(stage, done, len(arguments)))
 
+    def write_rows(
+        self, writer: OutputWriter, function: Callable[..., Rows], arguments: RowArguments, stage: str
+    ) -> list[dict[str, Any]]:
+        """Write files of parts that workers make, see `Pool`; the parts are beside the files, or in the store."""
+        files, shape, whole = writer.files, writer.shape, Window(0, 0, *writer.shape)
+        connection, first = self.workers, writer.folder / files[0].name
+        assert isinstance(connection, Connection)
+        cluster = with_store(connection.settings, writer.folder)
+        store = cluster.store
+        place = f"{store}/{digest(str(first))}" if store else first.with_name(f".{first.name}.parts")
+        run = uuid.uuid4().hex  # parts of a command that died are not used again
+        parts = Parts(Store(folder_at(place), NO_TILES, run), files, shape, run, codecs_of(files), cluster.retries)
+        if not store:
+            check_space(writer.folder, part_bytes(files, *shape) + file_bytes(files, *shape), "files and their parts")
+
+        def row(key: PartKey) -> tuple[Callable[..., None], tuple[Any, ...]]:
+            window = Window(BLOCK * key[1], 0, BLOCK, shape[1]).clipped(whole)
+            return _write_row, (parts, key, cluster, function, arguments(window))
+
+        def failed(_: PartKey, error: BaseException) -> NoReturn:
+            check_not_full(error, writer.folder)
+            if isinstance(error, SatIntervalsError):
+                raise error
+            raise RunError(f"{first} could not be written: {reason(error)}; rerun the same command") from error
+
+        def look(done: int) -> None:
+            self.progress(stage, min(shape[0], BLOCK * done), shape[0])
+
+        parts.store.remove()
+        connection.at_end.callback(parts.store.remove)  # once no worker writes any more
+        noted = finish_parts(parts, connection, row, failed, look)
+        copy_parts(parts, noted, writer, None if store else connection, self.progress)
+        parts.store.remove()
+        return [noted[0, number]["noted"] for number in range(parts.rows[0])]
+
+
+def pool_of(connection: Connection, out: Path, progress: Progress) -> EachOnWorkers:
+    """Return the workers of a connection; threads of this process if those do not share the folder ``out``."""
+    cluster = connection.settings
+    is_shared = cluster.kind in ("threads", "processes") or isinstance(out, RemotePath) or not is_remote(cluster)
+    return EachOnWorkers(connection if is_shared else connection.enter_context(Connection(Cluster(), out)), progress)
+
+
+def _write_row(
+    parts: Parts, key: PartKey, cluster: Cluster, function: Callable[..., Rows], arguments: tuple[Any, ...]
+) -> None:
+    with picklable_errors(), computing(cluster):
+        parts.check()
+        rasters, noted = function(*arguments)
+        write_part(parts, key, rasters, noted=noted)
+
 
 _FOUND = {"range": "the search range", "rows": "row offsets", "images": "mean and deviation of the images"} | {
     "heights": "the heights of the ground",
     "shifts": "the shifts of the images",
+    "extent": "the extent of the surface",
+    "alignment": "the shifts of the runs",
 }
 
 

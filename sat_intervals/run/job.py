@@ -28,14 +28,13 @@ from sat_intervals.run.state import check_folder, next_step, outputs_of, read_re
 from sat_intervals.store.arrays import DamagedFileError, numbered
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import MANIFEST, PLACE, StoreError, digest, place_of, read_manifest, write_manifest
-from sat_intervals.store.tiles import LAYOUT, ONCE, PARTS, TILES, DamagedTilesError, Store, home_of
+from sat_intervals.store.tiles import LAYOUT, NO_TILES, ONCE, PARTS, TILES, DamagedTilesError, Store, home_of
 from sat_intervals.tiling import Grid, Tile, Window
 
 # Settings without effect on tiles; those of the preset itself are listed one by one.
 _NOT_OF_TILES = {"preset", "rows", "median", "regularization", "products", "cluster"}
 _RANGE, _GROUND = "range", "ground"
 _REMOTE = "check URL and credentials, and pip install the package of its file system ('sat-intervals[remote]' for S3)"
-_NO_TILES = Grid(Window(0, 0, 0, 0), 1)
 
 
 @dataclass(frozen=True)
@@ -272,14 +271,14 @@ def kept_ground(out: Path, asked: str) -> tuple[GroundViews, dict[str, Any]] | N
     """Return what an earlier start of the same sweep in a folder has found, and what it noted of it; None without."""
     with suppress(StoreError, DamagedFileError):
         if manifest := read_manifest(home_of(out)):
-            return _read_ground(Store(place_of(home_of(out), manifest), _NO_TILES, ""), asked)
+            return _read_ground(Store(place_of(home_of(out), manifest), NO_TILES, ""), asked)
     return None
 
 
 def _known(out: Path, before: Mapping[str, Any], inputs: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return what an earlier run of the same images has found, see `Prepared.known`."""
     if PLACE in before:
-        return Store(place_of(home_of(out), before), _NO_TILES, "").meta(ONCE, _RANGE, origin_of(inputs)) or {}
+        return Store(place_of(home_of(out), before), NO_TILES, "").meta(ONCE, _RANGE, origin_of(inputs)) or {}
     if before.get("origin") == origin_of(inputs):
         statistics = before["normalization"] and {"rows": before["rows"], **before["normalization"]}
         return {"found": before["search"], "survey": before["survey"], "statistics": statistics}
@@ -297,8 +296,8 @@ def remove_tiles(out: Path) -> None:
     home = home_of(out)
     with suppress(StoreError):
         if manifest := read_manifest(home):
-            Store(place_of(home, manifest), _NO_TILES, "").remove()
-    Store(folder_at(home), _NO_TILES, "").remove()
+            Store(place_of(home, manifest), NO_TILES, "").remove()
+    Store(folder_at(home), NO_TILES, "").remove()
     (home / MANIFEST).unlink(missing_ok=True)
     folder_at(home).remove_if_empty()
 

@@ -84,23 +84,38 @@ def match_pair(
         Tiles failed; no output was published.
     """
     config, out = _named(load_config(config), volume_of), path_of(out)
-    seconds: dict[str, float] = {}
     with compiled_beside(config), Connection(config.cluster, out) as connection:
-        with logged_stage(seconds, "start"):
-            each = EachOnWorkers(connection, progress)
-            job = open_job(left, right, out, config, window=window, overwrite=overwrite, each=each)
-            job = replace(job, volume_of=volume_of)
-        with locked(out):
-            if not job.begin():
-                report = complete_before(job)
-            else:
-                with logged_stage(seconds, "kernels"):
-                    progress("kernels", 0, 1)
-                    compile_for(job)
-                    progress("kernels", 1, 1)
-                report = match_and_assemble(job, connection, seconds, progress)
-            end_tiles(job, keep_tiles=keep_tiles)
-            return report
+        each, how = EachOnWorkers(connection, progress), {"overwrite": overwrite, "keep_tiles": keep_tiles}
+        return matched_on(each, (left, right), out, config, window=window, volume_of=volume_of, **how)
+
+
+def matched_on(
+    each: EachOnWorkers,
+    images: tuple[str | Path | Image, str | Path | Image],
+    out: Path,
+    config: Config,
+    *,
+    window: Window | None = None,
+    keep_tiles: bool = False,
+    overwrite: bool = False,
+    volume_of: VolumeOf | None = None,
+) -> dict[str, Any]:
+    """Match two epipolar GeoTIFFs on workers, see `match_pair`."""
+    seconds, progress = dict[str, float](), each.progress
+    with logged_stage(seconds, "start"):
+        job = open_job(*images, out, config, window=window, overwrite=overwrite, each=each)
+        job = replace(job, volume_of=volume_of)
+    with locked(out):
+        if not job.begin():
+            report = complete_before(job)
+        else:
+            with logged_stage(seconds, "kernels"):
+                progress("kernels", 0, 1)
+                compile_for(job)
+                progress("kernels", 1, 1)
+            report = match_and_assemble(job, each.workers, seconds, progress)
+        end_tiles(job, keep_tiles=keep_tiles)
+        return report
 
 
 def _named(config: Config, volume_of: VolumeOf | None) -> Config:

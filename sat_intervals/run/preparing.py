@@ -1,4 +1,4 @@
-"""Prepare a pair on this machine: find its search range, compare its rows."""
+"""Prepare a pair alone: find its search range, compare its rows."""
 
 from pathlib import Path
 from typing import Any
@@ -7,7 +7,7 @@ from sat_intervals.config import Cluster, Config, load_config
 from sat_intervals.match.coarse import Found, NoRangeError
 from sat_intervals.match.parallax import Survey
 from sat_intervals.prepare.local import write_ranges
-from sat_intervals.prepare.pair import FilePair
+from sat_intervals.prepare.pair import Each, FilePair
 from sat_intervals.prepare.prepared import Prepared, prepare
 from sat_intervals.prepare.search_range import undeclared_lines
 from sat_intervals.progress import Progress
@@ -26,9 +26,12 @@ def prepared_here(
 ) -> Prepared[FilePair]:
     """Prepare a pair on this machine; row offsets stay."""
     with Connection(Cluster(), Path()) as connection:
-        each = EachOnWorkers(connection, progress)
-        config = config.model_copy(update={"rows": "none"})
-        return prepare(FilePair(left, right), config, each, measures_rows=measures_rows)
+        return _prepared(left, right, config, EachOnWorkers(connection, progress), measures_rows=measures_rows)
+
+
+def _prepared(left: Image, right: Image, config: Config, each: Each, *, measures_rows: bool) -> Prepared[FilePair]:
+    config = config.model_copy(update={"rows": "none"})
+    return prepare(FilePair(left, right), config, each, measures_rows=measures_rows)
 
 
 def range_of_pair(
@@ -49,11 +52,11 @@ def range_of_pair(
     return found, survey, [*lines, *rows_left(survey, "auto", right.path)]
 
 
-def compared_rows(left: Path, right: Path, progress: Progress) -> dict[str, Any]:
+def compared_rows(left: Path, right: Path, each: Each) -> dict[str, Any]:
     """Return how far rows of a pair differ: ``text``, ``warnings`` (lines), ``search`` (range) and ``survey``."""
     text = "not compared: too few matches"
     try:
-        survey = prepared_here(open_image(left), open_image(right), load_config(), progress).survey
+        survey = _prepared(open_image(left), open_image(right), load_config(), each, measures_rows=True).survey
     except NoRangeError as error:
         return {"text": text, "warnings": [str(error)], "search": None, "survey": None}
     assert survey is not None  # it was looked at

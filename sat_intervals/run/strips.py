@@ -1,9 +1,7 @@
-"""Finish strips of a run on workers: final bands, compressed as parts of the files, and overviews, as a binary tree."""
+"""Finish strips of a run on workers: final bands, as parts of the files."""
 
-import zlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
-from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
@@ -11,7 +9,6 @@ import numpy as np
 from sat_intervals.config import Config, HeightCalibration
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.kernels.conformal import AROUND, Margins, relief_of
-from sat_intervals.match import postprocess, refinement
 from sat_intervals.match.around import with_agreement
 from sat_intervals.match.ground import GroundViews
 from sat_intervals.match.memory import STRIP_PIXELS
@@ -29,95 +26,38 @@ from sat_intervals.match.statistics import Tally
 from sat_intervals.prepare.local import given_disparities
 from sat_intervals.products import SURFACE, Bands
 from sat_intervals.progress import Progress
-from sat_intervals.raster import BLOCK, codec_versions, compressed, factors, halved, read_views
+from sat_intervals.raster import BLOCK, read_views
 from sat_intervals.run.job import Job
+from sat_intervals.run.parts import PartKey, Parts, codecs_of, finish_parts, write_part
 from sat_intervals.run.state import files_of_run
-from sat_intervals.run.workers import Task, Workers, check_not_full, computing, picklable_errors, reason, results
-from sat_intervals.store.arrays import DamagedFileError
-from sat_intervals.store.manifest import digest
-from sat_intervals.store.tiles import PARTS, DamagedTilesError
+from sat_intervals.run.workers import Workers, check_not_full, computing, picklable_errors, reason
+from sat_intervals.store.tiles import DamagedTilesError
 from sat_intervals.tiling import Window
 
-PartKey = tuple[int, int]
-"""Level of a file, 0 for its pixels, and row of blocks from the top."""
 
-# What finishes rows decides their bytes, too. The number increases when parts change.
-_CODE = *(zlib.crc32(Path(str(module.__file__)).read_bytes()) for module in (postprocess, refinement)), 2
-_HALF = "half of {}"
-
-
-def rows_of_levels(region: Window) -> list[int]:
-    """Return the number of rows of blocks of each level."""
-    return [-(-region.height // (factor * BLOCK)) for factor in factors(region.height, region.width)]
-
-
-def codecs_of(config: Config) -> dict[str, Any]:
-    """Return what decides the bytes of parts in this process, beside the run."""
-    return codec_versions(config.products.compression) | {"code": _CODE}
-
-
-def parts_of(job: Job) -> str:
-    """Return what the parts of a run belong to: those of other settings or codecs are made again."""
-    return digest({"run": job.name, "codecs": codecs_of(job.config)})
-
-
-def part_name(key: PartKey) -> str:
-    """Return the name of a part's file."""
-    return f"{key[0]}_{key[1]}"
-
-
-def finish_strips(
-    job: Job, workers: Workers, scale: ConfidenceScale, progress: Progress
-) -> dict[PartKey, dict[str, Any]]:
-    """Make the parts of a run that are missing, once its tiles are done; return ``meta`` of all parts."""
-    counts, height = rows_of_levels(job.store.grid.region), job.store.grid.region.height
-    keys = [(level, row) for level in reversed(range(len(counts))) for row in range(counts[level])]
-    of = parts_of(job)
-    done = {key for key in keys if job.store.meta(PARTS, part_name(key), of)}
-    waiting = [key for key in keys if key not in done]
-    damaged: list[str] = []
-
-    def tasks() -> Iterator[Task | None]:
-        while waiting:
-            ready = (key for key in waiting if all(below in done for below in _below(key, counts)))
-            if (key := next(ready, None)) is None:
-                yield None
-            else:
-                waiting.remove(key)
-                more = [_below(key, counts)] if key[0] else [scale]
-                function = reduce_rows if key[0] else finish_strip
-                yield Task(key, function, (job, of, key, *more), job.config.cluster.retries)
-
-    def look(_: int) -> None:
-        progress("bands", min(height, BLOCK * sum(level == 0 for level, _ in done)), height)
-
-    for key, damage in results(workers, tasks(), partial(_fail, job), look) if waiting else ():
-        if damage is None:
-            done.add(key)
-        else:
-            damaged.append(damage)  # the other strips are finished before tiles are matched again
-    if damaged:
-        raise DamagedTilesError(damaged[0])
-    found = {key: meta for key in keys if (meta := job.store.meta(PARTS, part_name(key), of)) is not None}
-    if missing := [part_name(key) for key in keys if key not in found]:
-        raise damaged_parts(job, missing)
-    progress("bands", height, height)
-    return found
-
-
-def damaged_parts(job: Job, names: Sequence[str]) -> DamagedTilesError:
-    """Delete parts; return the error that says that they must be made again."""
-    job.store.delete(PARTS, names)
-    return DamagedTilesError(
-        f"parts {', '.join(names)} in {job.store.folder} are damaged or missing: rerun the same command: it makes "
-        "them again"
+def parts_of(job: Job) -> Parts:
+    """Return the parts of the files of a run."""
+    files, region = files_of_run(job.config), job.store.grid.region
+    return Parts(
+        job.store, files, (region.height, region.width), job.name, codecs_of(files), job.config.cluster.retries
     )
 
 
-def _below(key: PartKey, counts: Sequence[int]) -> list[PartKey]:
-    """Return the one or two rows of the level below that a row of an overview is made of."""
-    level, row = key
-    return [(level - 1, below) for below in (2 * row, 2 * row + 1) if level and below < counts[level - 1]]
+def finish_strips(
+    job: Job, parts: Parts, workers: Workers, scale: ConfidenceScale, progress: Progress
+) -> dict[PartKey, dict[str, Any]]:
+    """Make the parts of a run that are missing, once its tiles are done; return ``meta`` of all parts."""
+    height = parts.shape[0]
+
+    def look(rows: int) -> None:
+        progress("bands", min(height, BLOCK * rows), height)
+
+    def row(key: PartKey) -> tuple[Callable[..., str | None], tuple[Any, ...]]:
+        return finish_strip, (job, parts, key, scale)
+
+    found = finish_parts(parts, workers, row, partial(_fail, job), look)
+    progress("bands", height, height)
+    return found
 
 
 def _fail(job: Job, key: PartKey, error: BaseException) -> NoReturn:
@@ -131,11 +71,12 @@ def _fail(job: Job, key: PartKey, error: BaseException) -> NoReturn:
     ) from error
 
 
-def finish_strip(job: Job, of: str, key: PartKey, scale: ConfidenceScale) -> str | None:
+def finish_strip(job: Job, parts: Parts, key: PartKey, scale: ConfidenceScale) -> str | None:
     """Make the part of a strip; return what is wrong if tiles are damaged. Runs on a worker."""
     # also while it reads and writes: more strips at once would need more memory than `check_tiles` allows for
     with picklable_errors(), computing(job.config.cluster):
-        check_codecs(job, of)
+        job.check_version()
+        parts.check()
         region = job.store.grid.region
         search = job.config.disparity
         margin = halo(job.config) + (AROUND if job.swept and job.swept.calibration else 0)
@@ -162,7 +103,7 @@ def finish_strip(job: Job, of: str, key: PartKey, scale: ConfidenceScale) -> str
             return str(error)
         if job.swept:
             _to_heights(intervals, np.concatenate(counts)[first - top :][: shape[0]], job.ground())
-        _write(job, of, key, [intervals, validity], counts=tally.counts())
+        write_part(parts, key, [intervals, validity], counts=tally.counts())
     return None
 
 
@@ -208,46 +149,3 @@ def raw_rows(
         )  # both if there is one level
         here = slice(row, row := row + len(rows.winner))
         yield rows._replace(left=left[here], right=right[here]) if config.fits else rows
-
-
-def reduce_rows(job: Job, of: str, key: PartKey, below: Sequence[PartKey]) -> str | None:
-    """Make a row of blocks of an overview from parts of the level below; return what is wrong if one is damaged."""
-    with picklable_errors():
-        check_codecs(job, of)
-        halves = []
-        for part in map(part_name, below):
-            try:
-                with job.store.opened(PARTS, part, of) as archive:
-                    halves.append([archive[_HALF.format(file.kind)] for file in files_of_run(job.config)])
-            except DamagedFileError:
-                return str(damaged_parts(job, [part]))
-        _write(job, of, key, [np.concatenate(of_file, axis=1) for of_file in zip(*halves, strict=True)])
-    return None
-
-
-def _write(job: Job, of: str, key: PartKey, rasters: list[np.ndarray], **meta: Any) -> None:
-    """Write a part; ``rasters`` are emptied on the way, to save memory."""
-    blocks: dict[str, list[int]] = {}
-    is_top = key[0] + 1 == len(rows_of_levels(job.store.grid.region))
-
-    def arrays() -> Iterator[tuple[str, np.ndarray]]:
-        for file in files_of_run(job.config):
-            raster = rasters.pop(0)
-            made = compressed(raster, file)
-            blocks[file.kind] = made.sizes
-            yield file.kind, np.frombuffer(made.content, np.uint8)
-            del made
-            if not is_top:
-                yield _HALF.format(file.kind), halved(raster)
-
-    job.store.write(PARTS, part_name(key), arrays(), of=of, blocks=blocks, **meta)
-
-
-def check_codecs(job: Job, of: str) -> None:
-    """Raise if this process, a worker, makes other bytes than the command."""
-    job.check_version()
-    if of != parts_of(job):
-        raise RunError(
-            f"this worker compresses with {codecs_of(job.config)}, the command with other versions: install the same "
-            "version of rasterio for all"
-        )

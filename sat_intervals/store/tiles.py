@@ -12,10 +12,11 @@ from sat_intervals.errors import RunError
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY
 from sat_intervals.store.arrays import Archive, DamagedFileError, packed, unpacked
 from sat_intervals.store.folder import Folder
-from sat_intervals.tiling import Grid, Tile
+from sat_intervals.tiling import Grid, Tile, Window
 
 # Increase when files change: older tiles cannot be resumed.
 LAYOUT = 14
+NO_TILES = Grid(Window(0, 0, 0, 0), 1)
 # Subfolders: path states on borders, pixels and costs for later steps, tiles, parts of final files, failures, and
 # what is measured once a run.
 KINDS = BORDERS, PIXELS, COSTS, TILES, PARTS, FAILURES, ONCE = (

@@ -18,7 +18,6 @@ from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.dsm import check_sensors
 from sat_intervals.heights.rectify import raw_inputs
-from sat_intervals.prepare.pair import Each
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, OutputError, files_of, open_image
 from sat_intervals.raster.identity import check_not_replaced
@@ -26,7 +25,7 @@ from sat_intervals.raster.publishing import write_record
 from sat_intervals.results import open_run
 from sat_intervals.run.assemble import end_tiles
 from sat_intervals.run.connection import Connection
-from sat_intervals.run.each import EachOnWorkers
+from sat_intervals.run.each import EachOnWorkers, pool_of
 from sat_intervals.run.job import Job, open_job
 from sat_intervals.run.pair import Matched, check_failures, compile_for, complete_before, match_and_assemble, match_jobs
 from sat_intervals.run.state import OUTPUTS
@@ -64,12 +63,12 @@ def match_batch(
     sections = read_yaml(Path(config)) if isinstance(config, (str, Path)) else config  # once for all pairs
     common = load_config(sections, overrides, file=file)
     _check_not_replaced(pairs, [file, *named_files(sections), *named_files(overrides)], out)
-    surfaces = _Surfaces(pairs, out, on_rectified, overwrite=overwrite, progress=progress)
+    surfaces = _Surfaces(pairs, out, on_rectified, overwrite=overwrite)
     _raise_file_limit()
     with locked(out), ExitStack() as stack:
         report = _Report(out, pairs)
         with Connection(common.cluster, out) as connection:
-            each = EachOnWorkers(connection, progress)
+            each = pool_of(connection, out, progress)
             jobs: dict[str, Job] = {}
             for number, pair in enumerate(pairs):
                 progress("pairs", number, len(pairs))
@@ -89,10 +88,10 @@ def match_batch(
             progress("pairs", len(pairs), len(pairs))
             for name, state in _matched(jobs, connection, progress, keep_tiles=keep_tiles):
                 report.note({name: state})
-        for pair in pairs:
-            state = report.states[pair.name]
-            if pair.resolution and state["state"] != "failed":
-                report.note({pair.name: state | surfaces.made(pair)})
+            for pair in pairs:
+                state = report.states[pair.name]
+                if pair.resolution and state["state"] != "failed":
+                    report.note({pair.name: state | surfaces.made(pair, each)})
     return report.states
 
 
@@ -140,9 +139,9 @@ def _files(name: str) -> list[str]:
 class _Surfaces:
     """The surface models of the pairs with a resolution."""
 
-    def __init__(self, pairs: Sequence[PairOfBatch], out: Path, on_rectified: Rectified, **how: Any) -> None:
+    def __init__(self, pairs: Sequence[PairOfBatch], out: Path, on_rectified: Rectified, *, overwrite: bool) -> None:
         """Read models and grids, before hours of matching; those that cannot be used fail their pair at its end."""
-        self._out, self._on_rectified, self._how = out, on_rectified, how
+        self._out, self._on_rectified, self._overwrite = out, on_rectified, overwrite
         self._sensors: dict[str, Sequence[Path]] = {}
         self._errors: dict[str, SatIntervalsError] = {}
         self._orthos: dict[str, Job] = {}
@@ -159,13 +158,14 @@ class _Surfaces:
                 self._errors[pair.name] = error
                 _LOG.warning("%s: there will be no surface: %s", pair.name, error)
 
-    def job(self, pair: PairOfBatch, settings: Config, each: Each, *, keep_tiles: bool) -> Job | None:
+    def job(self, pair: PairOfBatch, settings: Config, each: EachOnWorkers, *, keep_tiles: bool) -> Job | None:
         """Return what is to be matched of a row; None of more images whose surface is there."""
-        out, overwrite = self._out / pair.name, self._how["overwrite"]
+        out, overwrite = self._out / pair.name, self._overwrite
         if not pair.more:
             if pair.resolution and (choices := _choices(pair)).calibration:
                 check_cells(_cells(pair), choices, resolved(settings).interval)
-            images, how = self._epipolar(pair, out), {"overwrite": overwrite, "pair": pair.name, "each": each}
+            images = self._epipolar(pair, out, each)
+            how: dict[str, Any] = {"overwrite": overwrite, "pair": pair.name, "each": each}
             return open_job(*images, out, settings, window=_window(pair), **how)
         options: dict[str, Any] = {name: pair.options.get(name) for name in ("crs", "geoid", "extent", "heights")}
         wanted = Wanted(pair.resolution or 0.0, **options, choices=_choices(pair))
@@ -177,14 +177,14 @@ class _Surfaces:
             self._orthos[pair.name] = job
         return job
 
-    def _epipolar(self, pair: PairOfBatch, out: Path) -> tuple[Image, Image]:
+    def _epipolar(self, pair: PairOfBatch, out: Path, pool: EachOnWorkers) -> tuple[Image, Image]:
         """Return the images to match: those of a pair, or the epipolar pair of its raw images."""
         images, sensors = _opened(pair), pair.sensors or ()
         if not pair.resolution:
             return images[0], images[1]
         raw = {name: pair.options.get(name) for name in ("dem", "altitude", "resolution_of")}
-        raw["geoid"] = pair.options.get("geoid") if raw["dem"] else None
-        made = epipolar_pair(images, out, sensors, _window(pair), self._on_rectified, **raw, **self._how)
+        raw |= {"geoid": pair.options.get("geoid") if raw["dem"] else None, "overwrite": self._overwrite}
+        made = epipolar_pair(images, out, pool, sensors, _window(pair), self._on_rectified, **raw)
         if pair.options.get("ortho"):
             raw_inputs(made.left.path, made.right.path)
         if not has_grids(sensors):
@@ -192,17 +192,17 @@ class _Surfaces:
         self._sensors[pair.name] = made.sensors
         return made.left, made.right
 
-    def made(self, pair: PairOfBatch) -> dict[str, Any]:
+    def made(self, pair: PairOfBatch, pool: EachOnWorkers) -> dict[str, Any]:
         """Make the surface of a matched pair, or the ortho-image of more; return what it adds to the pair's state."""
         try:
             if pair.name in self._errors:
                 raise self._errors[pair.name]
-            out, progress = self._out / pair.name, self._how["progress"]
+            out = self._out / pair.name
             if not pair.more:
                 cells = _cells(pair) | {"choices": _choices(pair)}
-                return {"surface": surface_of(out, self._sensors[pair.name], progress, **cells)}
+                return {"surface": surface_of(out, self._sensors[pair.name], pool, **cells)}
             if pair.name in self._orthos:
-                write_ortho(self._orthos[pair.name], progress)
+                write_ortho(self._orthos[pair.name], pool.progress)
             return {}
         except Exception as error:  # one pair's failure must not stop the others
             return _failed(error)

@@ -1,12 +1,16 @@
 """Make an epipolar pair of two raw images, and compare its rows."""
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from sat_intervals.config import load_config
 from sat_intervals.heights.rectify import RawPair, make_pair
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, open_image, path_of
+from sat_intervals.run.connection import Connection
+from sat_intervals.run.each import EachOnWorkers, pool_of
 from sat_intervals.run.preparing import compared_rows
 from sat_intervals.run.quality import doubts_of_images
 
@@ -24,6 +28,7 @@ def rectify(
     resolution_of: str | None = None,
     compares_rows: bool = True,
     overwrite: bool = False,
+    config: Any = None,
     progress: Progress = lambda stage, done, total: None,
 ) -> dict[str, Any]:
     """Resample two raw images to an epipolar pair, with its grids.
@@ -49,6 +54,9 @@ def rectify(
         Whether to measure how far rows of the pair differ.
     overwrite
         Whether a pair in ``out`` that was made otherwise may be replaced.
+    config
+        Settings, or a source for `load_config`, by default those of satellite images; their ``cluster`` says where the
+        images are resampled.
     progress
         Callback, see `Progress`.
 
@@ -63,13 +71,33 @@ def rectify(
     SatIntervalsError
         Images, models or heights cannot be used, or the folder holds a pair made otherwise.
     """
+    how: dict[str, Any] = {"dem": dem, "altitude": altitude, "geoid": geoid, "resolution_of": resolution_of}
+    images = [one if isinstance(one, Image) else open_image(one) for one in (left, right)]
+    how |= {"compares_rows": compares_rows, "overwrite": overwrite}
+    out = path_of(out)
+    with Connection(load_config(config).cluster, out) as connection:
+        return rectified(images, out, (left_model, right_model), pool_of(connection, out, progress), **how)
+
+
+def rectified(
+    images: Sequence[Image],
+    out: Path,
+    models: Sequence[str | Path | None],
+    pool: EachOnWorkers,
+    *,
+    compares_rows: bool = False,
+    overwrite: bool = False,
+    **raw: Any,
+) -> dict[str, Any]:
+    """Resample two raw images on workers; ``raw`` are ``dem``, ``altitude``, ``geoid``, ``resolution_of``."""
     from sat_intervals.heights.epipolar import Terrain  # needs the extra `dsm`
 
-    left, right = (one if isinstance(one, Image) else open_image(one) for one in (left, right))
+    left, right = images
     dem, geoid, left_model, right_model = (
-        None if file is None else path_of(file) for file in (dem, geoid, left_model, right_model)
+        None if file is None else path_of(file) for file in (raw["dem"], raw["geoid"], *(models or (None, None)))
     )
-    pair = RawPair(left, right, (left_model, right_model), Terrain(dem, altitude, geoid), resolution_of or "coarser")
-    compare = partial(compared_rows, progress=progress) if compares_rows else None
-    record = make_pair(pair, path_of(out), overwrite=overwrite, compare=compare, progress=progress)
+    terrain = Terrain(dem, raw["altitude"], geoid)
+    pair = RawPair(left, right, (left_model, right_model), terrain, raw["resolution_of"] or "coarser")
+    compare = partial(compared_rows, each=pool) if compares_rows else None
+    record = make_pair(pair, out, pool, overwrite=overwrite, compare=compare)
     return record | {"warnings": doubts_of_images(left, right)}

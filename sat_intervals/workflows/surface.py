@@ -8,18 +8,22 @@ from typing import Any, NamedTuple
 from sat_intervals.config import Interval, load_config, resolved
 from sat_intervals.errors import SatIntervalsError, check_absent
 from sat_intervals.heights.choices import SurfaceChoices, completion_of
-from sat_intervals.heights.dsm import check_sensors, checked_cells, make_surface, surface_tags
+from sat_intervals.heights.dsm import check_sensors, checked_cells, surface_of_runs, surface_tags
 from sat_intervals.heights.geometry import geometry_warnings, set_geometry
 from sat_intervals.heights.rectify import IMAGES, raw_inputs, rectified_files
 from sat_intervals.match.costs import check_cost
 from sat_intervals.products import ORTHO
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, check_not_replaced, files_of, open_image, path_of
-from sat_intervals.run.pair import match_pair
+from sat_intervals.results import open_run
+from sat_intervals.run.beside import compiled_beside
+from sat_intervals.run.connection import Connection
+from sat_intervals.run.each import EachOnWorkers, pool_of
+from sat_intervals.run.pair import matched_on
 from sat_intervals.run.state import OUTPUTS
 from sat_intervals.tiling import Window
 from sat_intervals.workflows.many import Wanted, surface_of_many
-from sat_intervals.workflows.rectify import rectify
+from sat_intervals.workflows.rectify import rectified
 
 # What is made of a run, in its folder.
 FILES = "geometry.json", "dsm.tif", ORTHO
@@ -114,30 +118,35 @@ def surface(
     opened = [one if isinstance(one, Image) else open_image(one) for one in images]
     config, out, geoid = load_config(config, images=len(opened)), path_of(out), path_of(geoid) if geoid else None
     resolution = path_of(resolution) if isinstance(resolution, str) else resolution
-    choices, raw = choices or SurfaceChoices(), {"dem": dem, "altitude": altitude, "resolution_of": resolution_of}
+    raw: dict[str, Any] = {"dem": dem, "altitude": altitude, "resolution_of": resolution_of}
+    choices = choices or SurfaceChoices()
     of_points = replace(choices, calibration=None, ortho=False, fill=None, flatten=None, mask=None) != SurfaceChoices()
     if len(opened) < 2:
         raise SatIntervalsError(f"images: {len(opened)} given, a surface needs two or more")
-    how: dict[str, Any] = {"overwrite": overwrite, "progress": progress}
+    how: dict[str, Any] = {"overwrite": overwrite, "keep_tiles": keep_tiles}
     if len(opened) > 2:
         check_absent(raw | {"window": window, "radius": radius, "a choice of points": of_points or None}, "two images")
         wanted = Wanted(resolution, crs, geoid, extent, heights, sensors, choices)
-        return surface_of_many(opened, out, config, wanted, keep_tiles=keep_tiles, **how)
+        return surface_of_many(opened, out, config, wanted, progress=progress, **how)
     check_absent({"extent": extent, "heights": heights}, "three images or more")
     check_cost(config)
     cells = {"resolution": resolution, "crs": crs, "radius": radius, "geoid": geoid}
     check_cells(cells, choices, resolved(config).interval)
-    pair = epipolar_pair(opened, out, sensors, window, on_rectified, geoid=geoid if dem else None, **raw, **how)
-    if choices.ortho:
-        raw_inputs(pair.left.path, pair.right.path)
-    grid = files_of(str(resolution)) if isinstance(resolution, Path) else ()
-    read = [file for one in opened for file in (one.path, one.mask)]
-    results = [out / name for name in (*OUTPUTS, *FILES)]
-    read += map(str, filter(None, (*pair.sensors, geoid, choices.flatten, choices.mask, *grid)))
-    check_not_replaced(read, results, [out / "tiles"])
-    check_sensors(pair.sensors, resolution, crs, choices)
-    run = match_pair(pair.left, pair.right, out, config, window=window, keep_tiles=keep_tiles, **how)
-    made = surface_of(out, pair.sensors, progress, **cells, choices=choices)
+    with compiled_beside(config), Connection(config.cluster, out) as connection:
+        pool = pool_of(connection, out, progress)
+        raw |= {"geoid": geoid if dem else None, "overwrite": overwrite}
+        pair = epipolar_pair(opened, out, pool, sensors, window, on_rectified, **raw)
+        if choices.ortho:
+            raw_inputs(pair.left.path, pair.right.path)
+        grid = files_of(str(resolution)) if isinstance(resolution, Path) else ()
+        read = [file for one in opened for file in (one.path, one.mask)]
+        results = [out / name for name in (*OUTPUTS, *FILES)]
+        read += map(str, filter(None, (*pair.sensors, geoid, choices.flatten, choices.mask, *grid)))
+        check_not_replaced(read, results, [out / "tiles"])
+        check_sensors(pair.sensors, resolution, crs, choices)
+        matching = EachOnWorkers(connection, progress)
+        run = matched_on(matching, (pair.left, pair.right), out, config, window=window, **how)
+        made = surface_of(out, pair.sensors, pool, **cells, choices=choices)
     doubts = pair.record["warnings"] if pair.record else []
     warnings = [*doubts, *run["warnings"], *geometry_warnings(made["geometry"])]
     return {"rectify": pair.record, "run": run, "surface": made, "warnings": warnings}
@@ -150,10 +159,10 @@ def check_cells(cells: Mapping[str, Any], choices: SurfaceChoices, interval: Int
     surface_tags(["run"], [interval], choices.for_intervals([interval]), cell, radius)
 
 
-def surface_of(out: Path, sensors: Sequence[Path], progress: Progress, **cells: Any) -> dict[str, Any]:
-    """Note the models and grids of a finished run and make its surface; ``cells`` are arguments of `make_surface`."""
+def surface_of(out: Path, sensors: Sequence[Path], pool: EachOnWorkers, **cells: Any) -> dict[str, Any]:
+    """Note the models and grids of a finished run and make its surface; ``cells`` are those of `surface_of_runs`."""
     set_geometry(out, *sensors)
-    return make_surface([out], out / "dsm.tif", **cells, progress=progress)
+    return surface_of_runs([open_run(out)], out / "dsm.tif", pool, **cells)
 
 
 def has_grids(sensors: Sequence[str | Path | None] | None) -> bool:
@@ -164,6 +173,7 @@ def has_grids(sensors: Sequence[str | Path | None] | None) -> bool:
 def epipolar_pair(
     images: Sequence[Image],
     out: Path,
+    pool: EachOnWorkers,
     sensors: Sequence[str | Path | None],
     window: Window | None,
     on_rectified: Rectified,
@@ -171,7 +181,7 @@ def epipolar_pair(
 ) -> Epipolar:
     """Return an epipolar pair with its models and grids; raw images are rectified in the folder of the run.
 
-    ``raw`` are further arguments of `rectify`.
+    ``raw`` are further arguments of `rectified`.
     """
     left, right = images
     files = (
@@ -188,8 +198,7 @@ def epipolar_pair(
         return Epipolar(left, right, files, None)
     if window:
         raise SatIntervalsError("window is a region of an epipolar image: rectify these raw images, then match them")
-    raw |= zip(("left_model", "right_model"), sensors, strict=False)
-    record = rectify(left, right, out, **raw, compares_rows=False)
+    record = rectified(images, out, sensors, pool, **raw)
     on_rectified(record)
     left, right = (open_image(out / name) for name in IMAGES)
     files = rectified_files(left.path, right.path)

@@ -25,11 +25,11 @@ from sat_intervals import demo, match_pair
 from sat_intervals.demo import OVER, PIXEL
 from sat_intervals.evaluate.change import open_pair
 from sat_intervals.evaluate.change_areas import ChangedAreas, signs_of
-from sat_intervals.heights.dsm import make_surface
 from sat_intervals.heights.geometry import set_geometry
 from sat_intervals.kernels.components import components
 from sat_intervals.raster import north_up, write_layer
 from sat_intervals.tiling import Window
+from sat_intervals.workflows.dsm import make_surface
 
 sys.path.append(str(Path(__file__).parents[1]))
 from cameras import EAST, LATITUDE, LONGITUDE, NORTH, cameras

@@ -21,10 +21,10 @@ from sat_intervals.demo import PIXEL
 from sat_intervals.evaluate.accuracy import Heights
 from sat_intervals.evaluate.surface_calibration import fitted, held_out
 from sat_intervals.heights.choices import BOUNDS, SurfaceChoices
-from sat_intervals.heights.dsm import make_surface
 from sat_intervals.heights.geometry import set_geometry
 from sat_intervals.kernels.conformal import relief_of, widened
 from sat_intervals.raster import north_up, write_layer
+from sat_intervals.workflows.dsm import make_surface
 
 sys.path.append(str(Path(__file__).parents[1]))
 from cameras import EAST, LATITUDE, LONGITUDE, NORTH, cameras

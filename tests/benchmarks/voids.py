@@ -19,11 +19,11 @@ from scipy.ndimage import maximum_filter, minimum_filter
 import sat_intervals
 from sat_intervals import demo, match_pair
 from sat_intervals.demo import PIXEL
-from sat_intervals.heights.dsm import make_surface
 from sat_intervals.heights.geometry import set_geometry
 from sat_intervals.kernels.filling import filled
 from sat_intervals.raster import north_up, read_layers, read_place, write_layer
 from sat_intervals.workflows.demo import CRS, write_views
+from sat_intervals.workflows.dsm import make_surface
 
 sys.path.append(str(Path(__file__).parents[1]))
 from cameras import EAST, LATITUDE, LONGITUDE, NORTH, cameras

@@ -23,13 +23,13 @@ from sat_intervals import SatIntervalsError
 from sat_intervals.config import load_calibration, load_height_calibration
 from sat_intervals.heights.alignment import solved
 from sat_intervals.heights.choices import BOUNDS, SurfaceChoices
-from sat_intervals.heights.dsm import make_surface
 from sat_intervals.heights.geometry import Geometry
 from sat_intervals.heights.lattice import Lattice
 from sat_intervals.kernels.registration import Registration
 from sat_intervals.products import OPEN_ABOVE, RANGE_INCOMPLETE, SURFACE
 from sat_intervals.raster import Projection, north_up, utm_of, write_layer
 from sat_intervals.raster.projection import transformed
+from sat_intervals.workflows.dsm import make_surface
 
 TO_DEGREES = Transformer.from_crs("EPSG:32631", "EPSG:4326", always_xy=True)
 BAND = {band.name: index for index, band in enumerate(SURFACE)}
@@ -319,7 +319,8 @@ def test_make_surface__does_not_depend_on_its_tiles(tmp_path, monkeypatch):
     monkeypatch.setattr("sat_intervals.heights.lattice.WINDOW", 7)
     monkeypatch.setattr("sat_intervals.heights.point_cloud.WINDOW", 5)
     monkeypatch.setattr("sat_intervals.heights.cells._TILE", 20)
-    monkeypatch.setattr("sat_intervals.heights.cells._LOWEST", 1)
+    for name in ("run.parts", "run.each", "raster.blocks", "raster.cog"):
+        monkeypatch.setattr(f"sat_intervals.{name}.BLOCK", 16)
     tiled, same_place, _ = surface_of([out], tmp_path, choices=choices)
     assert place == same_place
     assert_allclose(tiled, whole, atol=1e-4)
@@ -504,8 +505,8 @@ def test_dsm__ends_within_seconds_of_an_interrupt(tmp_path):
     out = write_run(tmp_path, np.ones((4, 1000, 1000), np.float32), np.zeros((1000, 1000), np.uint16))
     files = sensor_words(cameras(tmp_path, 1000, 1000))
     before = sorted(path.name for path in tmp_path.iterdir())
-    # 16 million cells of 1000 points each take a minute
-    command = [COMMAND, "dsm", out, *files, "--output", tmp_path / "dsm.tif", "--resolution", "0.125", "--radius", "4"]
+    # 16 million cells of 250 points each take a quarter of a minute
+    command = [COMMAND, "dsm", out, *files, "--output", tmp_path / "dsm.tif", "--resolution", "0.125", "--radius", "2"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         try:
             wait_until(lambda: list(tmp_path.glob(".*")), "a temporary file")

@@ -18,13 +18,13 @@ from rasterio.warp import reproject
 
 from sat_intervals import SatIntervalsError, match_pair
 from sat_intervals.demo import DATUM, PIXEL, VIEWS, make_scene
-from sat_intervals.heights.dsm import make_surface
 from sat_intervals.kernels.row_offsets import RowOffsets
 from sat_intervals.products import INVALID, POINTS
 from sat_intervals.raster import Projection
 from sat_intervals.raster.vertical import horizontal
 from sat_intervals.results import open_run
 from sat_intervals.tiling import Window
+from sat_intervals.workflows.dsm import make_surface
 
 with suppress(SatIntervalsError):  # without shareloc all tests here are skipped
     from sat_intervals.heights.geometry import geometry_of, set_geometry

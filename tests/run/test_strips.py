@@ -22,7 +22,8 @@ from sat_intervals.match.memory import strip_bytes
 from sat_intervals.products import INVALID
 from sat_intervals.raster import BLOCK, OutputError, OutputWriter, read_layers, write_layer
 from sat_intervals.results import open_run
-from sat_intervals.run import assemble, pair, strips
+from sat_intervals.run import pair, strips
+from sat_intervals.run import parts as parts_of_files
 from sat_intervals.run.checks import check_tiles
 from sat_intervals.run.job import open_job
 from sat_intervals.run.pair import match_pair
@@ -125,7 +126,7 @@ def test_match_pair__names_the_file_that_cannot_be_written(tall, tmp_path, monke
 
     out = with_tiles(tall, tmp_path / "out")
     with monkeypatch.context() as patch:
-        patch.setattr(assemble, "copy_part", full)
+        patch.setattr(parts_of_files, "copy_part", full)
         message = r"out/intervals.tif cannot be written: No space left on device: .*; rerun the same command"
         with pytest.raises(RunError, match=message):
             matched(tall, out, cluster={"retries": 0})
@@ -153,8 +154,8 @@ def test_finish_strips__with_zstd(tall, tmp_path):
 def test_finish_strip__refuses_a_worker_with_other_codecs(tall, tmp_path, monkeypatch):
     out = with_tiles(tall, tmp_path / "out")
     finish = strips.finish_strip
-    monkeypatch.setattr(strips, "finish_strip", lambda job, of, *rest: finish(job, "another", *rest))
-    with pytest.raises(RunError, match=r"this worker compresses with .*'gdal'.*install the same version of rasterio"):
+    monkeypatch.setattr(strips, "finish_strip", lambda job, parts, *rest: finish(job, replace(parts, codecs={}), *rest))
+    with pytest.raises(RunError, match=r"this worker compresses with .*'gdal'.*install the same versions of"):
         matched(tall, out)
     assert not parts(out)
 
@@ -216,7 +217,7 @@ def test_strip_bytes__bounds_what_writing_a_strip_takes(tmp_path):
     del noise
     job.begin()
     tracemalloc.start()
-    strips._write(job, strips.parts_of(job), (0, 0), rasters)
+    parts_of_files.write_part(strips.parts_of(job), (0, 0), rasters)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     most = strip_bytes(BLOCK, 5000, job.config)

@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -17,9 +17,10 @@ import pytest
 import rasterio
 import yaml
 from distributed import Client, LocalCluster
-from helpers import COMMAND, OUTPUTS, PATIENCE, PLACE, wait_until
+from helpers import COMMAND, OUTPUTS, PATIENCE, PLACE, invoke, wait_until
 
-from sat_intervals.raster import write_layer
+from sat_intervals.demo import make_scene
+from sat_intervals.raster import BLOCK, read_layers, write_layer
 from sat_intervals.run import pair as run
 from sat_intervals.run.job import open_job
 from sat_intervals.run.submit import DaskWorkers
@@ -42,11 +43,14 @@ def done_tiles(out: Path) -> set[str]:
 class Command:
     """``sat-intervals match`` as a process of its own."""
 
-    def __init__(self, pair: Path, out: Path, *options: str, left: Path | None = None) -> None:
+    def __init__(
+        self, pair: Path, out: Path, *options: str, left: Path | None = None, surface: Sequence[Path] = ()
+    ) -> None:
         self.out = out
         self.log = tempfile.TemporaryFile("w+")  # noqa: SIM115 (closed by `started`)
         command = [COMMAND, "match", left or pair / "left.tif", pair / "right.tif", out]
-        command += ["--config", pair / "settings.yaml", "--quiet", *options]
+        command += ["--config", pair / "settings.yaml"]
+        command = [*([COMMAND, "surface", *surface, out] if surface else command), "--quiet", *options]
         self.process = subprocess.Popen(list(map(str, command)), stdout=self.log, stderr=subprocess.STDOUT)
 
     def wait_for_tiles(self, count: int) -> None:
@@ -133,6 +137,31 @@ def test_match__survives_kill_9_of_workers_at_random_moments(pair, tmp_path):
             re.sub(r".*resource_tracker.*\n.*\n", "", command.output) == ""
         )  # Python's word on what a killed one held
     assert_complete(pair, tmp_path / "out")
+
+
+@pytest.mark.peer("shareloc")
+def test_surface__of_raw_images_survives_kill_9_of_workers_in_each_stage(tmp_path):
+    from raw import raw_pair  # needs the extra `dsm`
+
+    images = raw_pair(tmp_path / "raw", make_scene(1900, 90, seed=3))
+    options = "--disparity", "-20", "20", "--resolution", "0.4"
+    assert invoke("surface", *images, tmp_path / "threads", *options).exit_code == 0
+    out = tmp_path / "out"
+    options += "--cluster", "processes", "--workers", "2"
+    begins = {"left.tif": ".left.tif.parts/parts", "run.json": "tiles/tiles", "dsm.tif": ".dsm.tif.parts/parts"}
+    with started(tmp_path, out, *options, surface=images) as command:
+        for stage, begun in begins.items():
+            wait_until(lambda begun=begun: any(out.glob(begun)) or command.ended, stage)
+            assert not command.ended, command.output
+            kill(command.workers()[0])
+            assert not (out / stage).exists()
+        assert command.end() == 0, command.output
+    for name in ("left.tif", "right.tif", "left_grid.tif", "right_grid.tif", "intervals.tif", "validity.tif"):
+        assert (out / name).read_bytes() == (tmp_path / "threads" / name).read_bytes(), name
+    surface = read_layers(out / "dsm.tif")
+    assert surface.shape[1] > 2 * BLOCK
+    np.testing.assert_array_equal(surface, read_layers(tmp_path / "threads" / "dsm.tif"))
+    assert sorted(path.name for path in out.iterdir()) == sorted(path.name for path in (tmp_path / "threads").iterdir())
 
 
 def test_match__goes_on_after_kill_9_of_the_command(pair, tmp_path):
