@@ -42,11 +42,12 @@ class Gridding:
         """Return what `rows_of_cells` needs for some rows."""
         cells, margin = self.cells, AROUND if self.choices.calibration else 0
         around = rows.grown(margin, 0).clipped(Window(0, 0, cells.rows, cells.columns))
+        near = [cloud.near(cells.extent(around).grown(self.radius)) for cloud in self.clouds]
         tiles = []
         for windows in strips_of_windows((around.height, around.width), *self._tile_size(around)):
             for window in (replace(one, row=around.row + one.row) for one in windows):
                 extent = cells.extent(window).grown(self.radius)
-                tiles.append((window, [cloud.near(extent) for cloud in self.clouds]))
+                tiles.append((window, [cloud.near(extent) for cloud in near]))
         return rows, around, tiles, replace(self, clouds=())
 
     def _tile_size(self, around: Window) -> tuple[int, int]:

@@ -127,11 +127,14 @@ def _scheduler_errors() -> Iterator[None]:
 @contextmanager
 def connected(settings: Cluster, out: Path) -> Iterator[Client]:
     """Connect a client to the cluster of the settings; close it, and what it started, at the end."""
+    logs_all = logging.getLogger("sat_intervals").isEnabledFor(logging.DEBUG)
+    for name in () if logs_all else ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # after shareloc the root logger would print all of it
     with dask.config.set(DASK), _client(settings, out) as client:
         _LOG.info("connected to %s", client)
         if settings.kind == "processes":
             client.register_worker_callbacks(_ignore_interrupts)
-        if settings.kind != "address" and logging.getLogger("sat_intervals").isEnabledFor(logging.DEBUG):
+        if settings.kind != "address" and logs_all:
             client.register_worker_callbacks(_log_all)
             for name in ("sat_intervals", "distributed"):
                 client.forward_logging(name)

@@ -156,6 +156,7 @@ def test_surface__of_raw_images_survives_kill_9_of_workers_in_each_stage(tmp_pat
             kill(command.workers()[0])
             assert not (out / stage).exists()
         assert command.end() == 0, command.output
+        assert "distributed" not in command.output
     for name in ("left.tif", "right.tif", "left_grid.tif", "right_grid.tif", "intervals.tif", "validity.tif"):
         assert (out / name).read_bytes() == (tmp_path / "threads" / name).read_bytes(), name
     surface = read_layers(out / "dsm.tif")
