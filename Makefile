@@ -14,7 +14,7 @@ PARALLEL := -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 # Python keeps the bytecode of what it imports: each process would otherwise compile it again, in seconds.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-marked test-all lint bench bench-seams surface-bounds change-bench voids-bench ablation tune calibration coverage pictures docs dist clean
+.PHONY: demo test test-marked test-all lint bench bench-seams surface-bounds change-bench voids-bench ablation tune calibration coverage pictures notebook docs dist clean
 
 demo: $(VENV)/.has-plot
 	$(BIN)/sat-intervals demo demo-out --overwrite --size 800 800
@@ -94,6 +94,11 @@ pictures: $(VENV)/.has-dsm,plot
 	$(BIN)/sat-intervals surface $(MANY)/005.tif $(MANY)/006.tif demo-out/later --resolution 0.5 --band 2 --overwrite --quiet
 	$(BIN)/python docs/pictures/change.py demo-out/two demo-out/later demo-out/change demo-out/change.png
 	for name in overview profile wavefronts staircase rows surface many change; do $(BIN)/python -c 'import sys; from PIL import Image; Image.open(sys.argv[1]).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(sys.argv[2], optimize=True)' demo-out/$$name.png .github/pictures/$$name.png; done
+
+# docs/notebook.ipynb with what its cells print and draw; a minute.
+notebook: $(VENV)/.has-dsm,plot
+	rm -rf build/notebook && mkdir -p build/notebook
+	cd build/notebook && $(abspath $(BIN))/python -W error $(CURDIR)/docs/run_notebook.py
 
 # The documentation site, in site/; a warning is an error. Pictures of the gallery are made by running the commands.
 docs: $(VENV)/.has-docs,dsm,plot
