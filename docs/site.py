@@ -1,4 +1,4 @@
-"""Build the documentation site in site/; run it by ``make docs``. A warning of MkDocs is an error.
+"""Build the documentation site in site/; run it by ``make docs``. A warning of Zensical is an error.
 
 Pages are README.md, METHOD.md, CHANGELOG.md, docs/*.md and the notebook with their links adapted. The references of
 commands, settings and Python are generated from click, pydantic and docstrings. Commands make pictures of the gallery.
@@ -223,5 +223,5 @@ def write_pages() -> None:
 if __name__ == "__main__":
     write_pages()
     (PAGES / "gallery.md").write_text(gallery())
-    subprocess.run([sys.executable, "-m", "mkdocs", "build", "--clean", "--strict"], cwd=ROOT, check=True)
+    subprocess.run([sys.executable, "-m", "zensical", "build", "--clean", "--strict"], cwd=ROOT, check=True)
     print("Open site/index.html")
