@@ -104,12 +104,14 @@ notebook: $(VENV)/.has-dsm,plot
 docs: $(VENV)/.has-docs,dsm,plot
 	$(BIN)/python docs/site.py
 
-# Wheel and sdist in dist/, checked; the wheel is installed and run in an empty environment.
+# Wheel and sdist in dist/, checked, whose README has whole addresses; the wheel is installed and run in an empty environment.
 dist:
-	rm -rf dist
+	rm -rf dist build/source && mkdir -p build/source
+	git ls-files -z | xargs -0 cp --parents -t build/source
+	$(PYTHON) docs/pypi_readme.py build/source
 	$(PYTHON) -m venv --clear build/tools
 	build/tools/bin/python -m pip install --quiet --disable-pip-version-check build cffconvert twine
-	build/tools/bin/python -m build
+	build/tools/bin/python -m build --outdir dist build/source
 	build/tools/bin/twine check --strict dist/*
 	build/tools/bin/cffconvert --validate
 	$(PYTHON) -m venv --clear build/wheel

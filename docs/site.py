@@ -64,6 +64,7 @@ def adapted(text: str) -> str:
     text = re.sub(r"\]\((?:\.\./)?README\.md", "](index.md", text)
     text = re.sub(r"\]\((?:\.\./)?docs/", "](", text)
     text = re.sub(r"\]\((?:\.\./)?\.github/pictures/", "](pictures/", text)
+    text = text.replace("](notebook.ipynb)", "](notebook.md)")
     text = re.sub(r"!\[([^\]]*)\]\(([^)]*)\)", r"[![\1](\2)](\2)", text)
     text = re.sub(r"^(?:sat-intervals|otbcli_|parallel_stereo)[^#|'\"\n]{78,}$", folded, text, flags=re.MULTILINE)
     return text.replace("](../", "](")
