@@ -14,7 +14,7 @@ PARALLEL := -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 # Python keeps the bytecode of what it imports: each process would otherwise compile it again, in seconds.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-marked test-all lint bench bench-seams surface-bounds change-bench voids-bench ablation tune calibration coverage pictures notebook docs dist clean
+.PHONY: demo test test-marked test-all lint bench bench-seams surface-bounds change-bench many-bench voids-bench ablation tune calibration coverage pictures notebook docs dist clean
 
 demo: $(VENV)/.has-plot
 	$(BIN)/sat-intervals demo demo-out --overwrite --size 800 800
@@ -65,6 +65,10 @@ surface-bounds: $(VENV)/.has-dsm
 # The tables of docs/change.md, on the images of SAT_INTERVALS_SHARED and exact scenes; half an hour.
 change-bench: $(VENV)/.has-dsm
 	$(BIN)/python -W ignore tests/benchmarks/change.py
+
+# The table of docs/many.md, on the images of SAT_INTERVALS_SHARED and exact scenes; five minutes.
+many-bench: $(VENV)/.has-dsm
+	$(BIN)/python -W ignore tests/benchmarks/many.py
 
 # The table of docs/heights.md on voids, on the images of SAT_INTERVALS_SHARED and exact scenes; a quarter of an hour.
 voids-bench: $(VENV)/.has-dsm
