@@ -14,7 +14,7 @@ PARALLEL := -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 # Python keeps the bytecode of what it imports: each process would otherwise compile it again, in seconds.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-marked test-all lint bench bench-seams surface-bounds change-bench voids-bench ablation tune calibration coverage pictures docs dist clean
+.PHONY: demo test test-marked test-all lint bench bench-seams surface-bounds change-bench many-bench voids-bench ablation tune calibration coverage pictures notebook docs dist clean
 
 demo: $(VENV)/.has-plot
 	$(BIN)/sat-intervals demo demo-out --overwrite --size 800 800
@@ -66,6 +66,10 @@ surface-bounds: $(VENV)/.has-dsm
 change-bench: $(VENV)/.has-dsm
 	$(BIN)/python -W ignore tests/benchmarks/change.py
 
+# The table of docs/many.md, on the images of SAT_INTERVALS_SHARED and exact scenes; five minutes.
+many-bench: $(VENV)/.has-dsm
+	$(BIN)/python -W ignore tests/benchmarks/many.py
+
 # The table of docs/heights.md on voids, on the images of SAT_INTERVALS_SHARED and exact scenes; a quarter of an hour.
 voids-bench: $(VENV)/.has-dsm
 	$(BIN)/python -W ignore tests/benchmarks/voids.py
@@ -95,16 +99,23 @@ pictures: $(VENV)/.has-dsm,plot
 	$(BIN)/python docs/pictures/change.py demo-out/two demo-out/later demo-out/change demo-out/change.png
 	for name in overview profile wavefronts staircase rows surface many change; do $(BIN)/python -c 'import sys; from PIL import Image; Image.open(sys.argv[1]).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(sys.argv[2], optimize=True)' demo-out/$$name.png .github/pictures/$$name.png; done
 
+# docs/notebook.ipynb with what its cells print and draw; a minute.
+notebook: $(VENV)/.has-dsm,plot
+	rm -rf build/notebook && mkdir -p build/notebook
+	cd build/notebook && $(abspath $(BIN))/python -W error $(CURDIR)/docs/run_notebook.py
+
 # The documentation site, in site/; a warning is an error. Pictures of the gallery are made by running the commands.
 docs: $(VENV)/.has-docs,dsm,plot
 	$(BIN)/python docs/site.py
 
-# Wheel and sdist in dist/, checked; the wheel is installed and run in an empty environment.
+# Wheel and sdist in dist/, checked, whose README has whole addresses; the wheel is installed and run in an empty environment.
 dist:
-	rm -rf dist
+	rm -rf dist build/source && mkdir -p build/source
+	git ls-files -z | xargs -0 cp --parents -t build/source
+	$(PYTHON) docs/pypi_readme.py build/source
 	$(PYTHON) -m venv --clear build/tools
 	build/tools/bin/python -m pip install --quiet --disable-pip-version-check build cffconvert twine
-	build/tools/bin/python -m build
+	build/tools/bin/python -m build --outdir dist build/source
 	build/tools/bin/twine check --strict dist/*
 	build/tools/bin/cffconvert --validate
 	$(PYTHON) -m venv --clear build/wheel

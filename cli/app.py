@@ -41,14 +41,14 @@ _ITEM = "\n  "
 RESUMED = ("match", "demo", "batch", "surface", "rectify")
 STEPS: dict[str, tuple[click.Command, ...]] = {
     "Try and prepare": (demo, search_range, plan, config),
+    "Surfaces": (surface, change, rectify, dsm, triangulate),
     "Match": (match, batch, status),
     "Inspect": (plot, report, project),
-    "Heights": (surface, change, rectify, dsm, triangulate),
     "Compare with a truth": (reference, evaluate, calibrate),
     "Use elsewhere": (export, stac),
 }
 # The most common commands, which the command without arguments shows.
-_DAILY = (demo, match, status, report, project, surface, dsm, evaluate, export)
+_DAILY = (demo, surface, change, dsm, match, status, report, project, evaluate, export)
 
 
 class _Commands(click.Group):
@@ -116,7 +116,7 @@ def _end(status: int, message: str) -> NoReturn:
 @click.version_option(package_name="sat-intervals")
 @click.pass_context
 def main(context: click.Context) -> None:
-    """Match satellite images: a disparity for every pixel, with its interval."""
+    """Surface models and disparities of satellite images, two or many, with an interval for every value."""
     if context.invoked_subcommand is None:
         formatter = context.make_formatter()
         formatter.write_text(main.help or "")

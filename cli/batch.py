@@ -11,21 +11,26 @@ from sat_intervals.cli.options import FILE, Grouped
 from sat_intervals.cli.rectify import say_rectified
 
 
-@click.command(cls=Grouped, short_help="Match many pairs; a rerun matches the missing ones.")
+@click.command(cls=Grouped, short_help="Match many pairs or stacks; a rerun matches the missing ones.")
 @click.argument("pairs", type=FILE)
 @click.argument("out", type=FILE)
 @settings_options
 @run_options
 def batch(pairs: Path, out: Path, settings: SettingsArguments, run: RunArguments) -> None:
-    """Match the PAIRS of a CSV, YAML or JSON file, each into its own folder in OUT.
+    """Match the PAIRS of a CSV, YAML or JSON file, or make surfaces, each in its own folder in OUT.
 
-    Columns: name, left, right, minimum, maximum, left_mask, right_mask, nodata, band, window, and any setting such as
-    sgm.p2. Rows with resolution also produce a surface model, as `surface` does: of raw images with RPC models, or of
-    an epipolar pair with left_model, right_model, left_grid, right_grid; further columns crs, radius, geoid, dem,
-    altitude, resolution_of, height_calibration, ortho, fill (metres), flatten, mask. Rows with images, names or
-    patterns separated by spaces, in place of left and right make the surface of them, of three and more all at once;
-    further columns crs, geoid, extent, heights, ortho, height_calibration, fill, flatten, mask. A failed pair does not
-    stop the others. OUT/batch.json has the state of each pair; the exit status is 1 if any failed.
+    Columns of a pair: name, left, right, minimum, maximum, left_mask, right_mask, nodata, band, window, and any setting
+    such as sgm.p2.
+
+    With resolution also its surface model, as by `surface`: of raw images with RPC models, or of an epipolar pair with
+    left_model, right_model, left_grid, right_grid. Further columns: crs, radius, geoid, dem, altitude, resolution_of,
+    height_calibration, ortho, fill (metres), flatten, mask.
+
+    Of many images: name, resolution, and images (names or patterns separated by spaces) in place of left and right.
+    Further columns: crs, geoid, extent, heights, height_calibration, ortho, fill, flatten, mask.
+
+    A failed pair does not stop the others. OUT/batch.json has the state of each pair; the exit status is 1 if any
+    failed.
     """
     from sat_intervals.config.batch import REPORT, read_batch
     from sat_intervals.heights.geometry import geometry_warnings

@@ -11,7 +11,7 @@ from sat_intervals.cli.calibrate_dsm import calibrate_heights
 from sat_intervals.cli.matching import SettingsArguments, settings_options
 
 
-@click.command(cls=options.Grouped, short_help="Find the levels that reach a coverage, on pairs with known truth.")
+@click.command(cls=options.Grouped, short_help="Find what intervals need for a coverage, with a truth.")
 @click.argument("pairs", nargs=-1, type=options.FILE)
 @click.option("--output", type=options.FILE, required=True, help="Calibration to write (YAML).")
 @options.overwrite_option

@@ -9,7 +9,7 @@ from sat_intervals.cli import options
 from sat_intervals.cli.logs import warn
 
 
-@click.command(cls=options.Grouped, short_help="Find what changed between two dates, at a named rate of false alarms.")
+@click.command(cls=options.Grouped, short_help="Find changes between two dates at a named rate of false alarms.")
 @click.argument("before", type=options.FILE)
 @click.argument("after", type=options.FILE)
 @click.argument("out", type=options.FILE)
@@ -34,8 +34,8 @@ def change(before: Path, after: Path, out: Path, no_register: bool, printing: op
 
     AFTER is moved to BEFORE by their constant shift, as the reference in `evaluate`, and resampled to its cells, with
     the worst bounds of the cells it draws from. Significance is the probability of a difference as large without a
-    change. Surfaces of other tools need --sigma, or a band named sigma. Polygons need pip install
-    'sat-intervals[reference]'. Then: sat-intervals plot OUT, report OUT, project OUT.
+    change. Surfaces of other tools need --sigma, or a band named sigma. Polygons need the extra [reference]. Then: plot
+    OUT, report OUT, project OUT.
     """  # noqa: D301, D400 (\b keeps the line breaks in click)
     from sat_intervals.cli.tables import change_lines
     from sat_intervals.workflows.change import FILES, change

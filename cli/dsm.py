@@ -74,7 +74,7 @@ _CELL_OPTIONS = (
     click.option(
         "--ortho",
         is_flag=True,
-        help="Write ortho.tif beside it: both raw images, of many their median, on its grid.",
+        help="Write ortho.tif on its grid: both raw images, or the median of three and more.",
     ),
 )
 
@@ -167,7 +167,7 @@ def say_surface(console: "Console", report: dict[str, Any]) -> None:
     )
 
 
-@click.command(cls=options.Grouped, short_help="Make a surface model with height intervals from one or several runs.")
+@click.command(cls=options.Grouped, short_help="Make a surface model of one or several finished runs.")
 @click.argument("outs", metavar="OUT...", nargs=-1, required=True, type=options.FILE)
 @cell_options
 @calibration_option("--calibration")
@@ -197,7 +197,7 @@ def dsm(
     and row (bands 1 and 2) of epipolar positions, as written by CARS and shareloc, or displacements to them, if OTB's
     tag METADATATYPE=OTB says so. Give them once for each OUT: OUT/geometry.json names them for later commands. A pair
     that `rectify` has made needs neither. Swapping both models and grids of left and right is not detected, and inverts
-    the relief. Needs shareloc: pip install 'sat-intervals[dsm]'.
+    the relief. Needs the extra [dsm].
 
     Bands: height, height_lower, height_upper, count, confidence, agreement. Heights refer to the WGS 84 ellipsoid
     unless --geoid is given. A point contributes to its cell and to cells whose centre is within --radius. Other cells

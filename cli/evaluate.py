@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 _BIAS = 0.25
 
 
-@click.command(cls=Grouped, short_help="Evaluate intervals against a known truth.")
-@click.argument("folders", metavar="OUT...", nargs=-1, type=FILE)
+@click.command(cls=Grouped, short_help="Compare intervals, or heights of a surface, with a truth.")
+@click.argument("folders", metavar="[OUT]...", nargs=-1, type=FILE)
 @click.option("--truth", "truths", type=FILE, multiple=True, help="True disparity; one for each OUT, in that order.")
 @click.option(
     "--mask", "masks", type=FILE, multiple=True, help="Pixels to evaluate (not 0); one for each OUT, in that order."
@@ -54,7 +54,7 @@ def evaluate(
     printing: Printing,
     **how: Any,
 ) -> None:
-    """Evaluate the intervals of the runs in the folders OUT against the truth of their left images.
+    """Evaluate the intervals of the runs in the folders OUT against the truth of their images, or a surface (--dsm).
 
     Prints figures over valid pixels: coverage (share of intervals that contain the truth), widths and interval score;
     --json also has the paper's relative size (median width / width of the search range) and relative overestimation

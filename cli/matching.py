@@ -85,7 +85,12 @@ class RunArguments(Printing):  # type: ignore[misc,unused-ignore]
 
 
 _LEVEL_OPTIONS = (
-    click.option("--coverage", type=float, metavar="C", help="Share of true disparities to be inside, .5 to .99."),
+    click.option(
+        "--coverage",
+        type=float,
+        metavar="C",
+        help="Share of true values that intervals contain, .5 to .99; default .9.",
+    ),
     click.option("--calibration", type=NAME, help="Calibration for --coverage; default the built-in one."),
     expert_option("--alpha", type=float, metavar="A", help="Level of possibility, above 0 to 1; no coverage."),
 )
@@ -103,8 +108,8 @@ _FIRST_SETTINGS = (
     click.option(
         "--preset",
         type=click.Choice(PRESETS),
-        help="satellite (default), satellite-mccnn for different dates or little texture, paper for the paper's "
-        "figures.",
+        help="satellite (default), satellite-mccnn for different dates or little texture, paper and mccnn for close "
+        "range, many for three images or more (surface takes it by itself).",
     ),
 )
 _LAST_SETTINGS = (

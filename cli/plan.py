@@ -35,8 +35,8 @@ def plan(
 ) -> None:
     """Estimate tiles, memory, disk and time of matching LEFT and RIGHT, or of the surface of three images or more.
 
-    The time comes from a sample matched at the centre, or elsewhere if there is no data. Options and settings are those
-    of match, or of surface, whose grid and heights are found.
+    The time comes from a sample matched at the centre, or elsewhere if there is no data. Options are those of match; of
+    three images or more those of surface, whose shifts, grid and heights are found.
     """
     from sat_intervals.cli.console import Console, lines_of_grid
     from sat_intervals.run.workers import parse_memory

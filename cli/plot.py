@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from sat_intervals.results import Results
 
 
-@click.command(short_help="Draw a finished run: maps, profile of a row, errors, cost curve of a pixel.")
+@click.command(short_help="Draw a finished run: maps, errors, a row, a pixel.")
 @click.argument("out", type=FILE)
 @truth_option
 @click.option("--row", type=int, metavar="R", help="Draw the profile of this row.")
@@ -53,7 +53,7 @@ def plot(
     OUT/change.png     of a folder of `change`: significant changes of height
 
     Of three images and more, only dsm.png and ortho.png are drawn. Rows and columns count from 0 at the first pixel of
-    OUT/intervals.tif. Needs matplotlib: pip install 'sat-intervals[plot]'.
+    OUT/intervals.tif. Needs the extra [plot].
     """  # noqa: D301 (\b keeps the line breaks in click)
     from sat_intervals.results import open_results, read_change
     from sat_intervals.show.accuracy import draw_coverage

@@ -14,16 +14,15 @@ def project(out: Path) -> None:
     """Write OUT/project.qgz, a QGIS project of the finished run in the folder OUT.
 
     \b
-    OUT/project.qgz           images, disparity, width, confidence, validity, and
-                              heights with hillshade and ortho-image after dsm:
-                              then what is on no map is off
+    OUT/project.qgz           images, disparity, width, confidence, validity;
+                              with dsm.tif heights, hillshade, ortho-image (layers
+                              without CRS are then off);
+                              of `change`: change, difference, significance
     OUT/width.vrt             interval width, computed when it is read
     OUT/dsm_half_width.vrt    half the width of the intervals of heights
-    OUT/project.qgz           of a folder of `change`: change, difference,
-                              significance
     OUT/*.qml                 style of the raster of the same name
 
-    QGIS 3.22 or newer opens it. Of the folder of a batch each pair that is done gets one. Files of these names are
+    For QGIS 3.22 or newer. Of the folder of a batch each pair that is done gets one. Files of these names are
     replaced: save changes in QGIS under another name.
     """  # noqa: D301 (\b keeps the line breaks in click)
     from sat_intervals.run.status import runs_of

@@ -66,8 +66,8 @@ def rectify(
                                        metres per pixel of disparity, rows
 
     Then: sat-intervals match OUT/left.tif OUT/right.tif RUN, and dsm RUN, which finds models and grids by rectify.json.
-    `surface` does all of it. Models: RPC in tags of GeoTIFF or NITF, .RPB, _RPC.TXT, DIMAP XML, .geom.
-    Needs shareloc: pip install 'sat-intervals[dsm]'.
+    `surface` does all of it. Models: RPC in tags of GeoTIFF or NITF, .RPB, _RPC.TXT, DIMAP XML, .geom. Needs the extra
+    [dsm].
     """  # noqa: D301 (click's mark of a preformatted paragraph)
     from sat_intervals.workflows.rectify import rectify
 

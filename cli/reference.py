@@ -49,8 +49,7 @@ def reference(
     The reference is first moved by its constant shift from the heights of the run (easting, northing, height), which
     is printed with its standard deviation. On flat ground only the height is moved.
 
-    Models and grids are those of `dsm`. Needs shareloc: pip install 'sat-intervals[dsm]'; points need pip install
-    'sat-intervals[reference]'.
+    Models and grids are those of `dsm`. Needs the extra [dsm], points [reference].
     """
     if (heights is None) == (points is None):
         raise click.UsageError("give either --heights or --points.")

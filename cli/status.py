@@ -16,8 +16,7 @@ from sat_intervals.cli.options import FILE, json_option, say_json
 def status(out: Path, as_json: bool) -> None:
     """Show how many tiles and strips of the run in OUT are done, during the run or after it ended.
 
-    For the folder of a batch, show the progress of each
-    pair, and why pairs failed, without reading the files.
+    Of the folder of a batch, the progress of each pair, and why pairs failed.
     """
     from sat_intervals.results import open_run
     from sat_intervals.run.state import is_complete

@@ -13,7 +13,7 @@ from sat_intervals.cli.options import FILE, Grouped, sensor_options
 from sat_intervals.cli.rectify import raw_options, say_rectified
 
 
-@click.command(cls=Grouped, short_help="Match two images or many and make a surface model.")
+@click.command(cls=Grouped, short_help="Make a surface model of two images or many.")
 @search_options
 @many_options
 @click.argument("out", type=FILE)
@@ -33,7 +33,7 @@ def surface(
     settings: SettingsArguments,
     run: RunArguments,
 ) -> None:
-    """Match two images, or three and more at once, and write the surface model to OUT/dsm.tif.
+    """Make the surface model OUT/dsm.tif, with bounds of its heights, of two images, or three and more at once.
 
     Two images, LEFT and RIGHT, are raw images with RPC models, or an epipolar pair with the models and grids of its raw
     images. Raw images become the epipolar pair OUT/left.tif, OUT/right.tif, as by `rectify`; heights of --dem refer to

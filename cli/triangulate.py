@@ -27,10 +27,10 @@ def triangulate(
     points.tif    longitude, latitude, height, its two bounds, residual,
                   positions of the points at both bounds
     points.laz    x, y (UTM), z, intensity; extra dimensions lower, upper,
-                  confidence. Needs pip install 'sat-intervals[reference]'
+                  confidence; needs the extra [reference]
 
     Heights are above the ellipsoid of WGS 84. Models and grids are those of `dsm`.
-    Needs shareloc: pip install 'sat-intervals[dsm]'.
+    Needs the extra [dsm].
     """  # noqa: D301 (\b keeps the line breaks in click)
     from sat_intervals.heights.triangulate import triangulate
 

@@ -1,14 +1,16 @@
-"""Build the documentation site in site/; run it by ``make docs``. A warning of MkDocs is an error.
+"""Build the documentation site in site/; run it by ``make docs``. A warning of Zensical is an error.
 
-Pages are README.md, METHOD.md, CHANGELOG.md and docs/*.md with their links adapted; the references of commands,
-settings and Python are generated from click, pydantic and docstrings; pictures of the gallery are made by commands.
+Pages are README.md, METHOD.md, CHANGELOG.md, docs/*.md and the notebook with their links adapted. The references of
+commands, settings and Python are generated from click, pydantic and docstrings. Commands make pictures of the gallery.
 """
 
+import json
 import re
 import shutil
 import subprocess
 import sys
 import textwrap
+from base64 import b64decode
 from collections.abc import Iterator
 from pathlib import Path
 from types import NoneType
@@ -48,6 +50,8 @@ GALLERY = (
     ),
     ("A relief, with local ranges", f"sat-intervals demo relief --size 500 500 --relief 60 {LOCAL}", ""),
     ("Its maps", "sat-intervals plot relief --dpi 90", "relief/overview.png"),
+    ("Raw images of a scene, and the surface of all", "sat-intervals demo many --images 5 --size 300 340", ""),
+    ("Its heights and half widths", "sat-intervals plot many --dpi 90", "many/dsm.png"),
 )  # fmt: skip
 
 
@@ -60,6 +64,7 @@ def adapted(text: str) -> str:
     text = re.sub(r"\]\((?:\.\./)?README\.md", "](index.md", text)
     text = re.sub(r"\]\((?:\.\./)?docs/", "](", text)
     text = re.sub(r"\]\((?:\.\./)?\.github/pictures/", "](pictures/", text)
+    text = text.replace("](notebook.ipynb)", "](notebook.md)")
     text = re.sub(r"!\[([^\]]*)\]\(([^)]*)\)", r"[![\1](\2)](\2)", text)
     text = re.sub(r"^(?:sat-intervals|otbcli_|parallel_stereo)[^#|'\"\n]{78,}$", folded, text, flags=re.MULTILINE)
     return text.replace("](../", "](")
@@ -157,8 +162,8 @@ def python_reference() -> str:
 
 
 def gallery() -> str:
-    """Run the commands of the gallery and return its page."""
-    lines = ["# Gallery", "", "Each picture was made by the command above it.", ""]
+    """Run the commands of the gallery and return its page, below docs/gallery.md."""
+    lines = [adapted((ROOT / "docs" / "gallery.md").read_text()), "Each command below makes the picture under it.", ""]
     folder = PAGES / "gallery-files"
     folder.mkdir()
     for title, command, files in GALLERY:
@@ -167,11 +172,30 @@ def gallery() -> str:
         subprocess.run([sys.executable, *words], cwd=folder, check=True, stdout=subprocess.DEVNULL)
         lines += [f"## {title}", "", "```", command, "```", ""]
         for file in files.split():
+            if not (folder / file).exists():
+                raise FileNotFoundError(f"{command} has not made {file}")
             link = f"gallery-files/{file}"
             lines += [f"[![{title}]({link})]({link})" if file.endswith(".png") else f"[Open the page]({link})", ""]
     for file in [path for path in folder.rglob("*.*") if path.suffix not in (".png", ".html")]:
         file.unlink()
     return "\n".join(lines)
+
+
+def notebook(target: Path) -> str:
+    """Return the page of the notebook, with what its cells have printed; write its pictures to a folder."""
+    target.mkdir()
+    text = []
+    for number, cell in enumerate(json.loads((ROOT / "docs" / "notebook.ipynb").read_text())["cells"]):
+        source = "".join(cell["source"])
+        text.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
+        for k, output in enumerate(cell.get("outputs", [])):
+            if "text" in output:
+                text.append(f"```text\n{''.join(output['text'])}```")
+            else:
+                picture = target / f"{number}-{k}.png"
+                picture.write_bytes(b64decode(output["data"]["image/png"]))
+                text.append(f"![Pictures of this cell]({target.name}/{picture.name})")
+    return "\n\n".join([*text, ""])
 
 
 # Long commands and wide tables are read without scrolling.
@@ -190,6 +214,7 @@ def write_pages() -> None:
     for file in (ROOT / "README.md", ROOT / "METHOD.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").glob("*.md")):
         name = "index.md" if file.name == "README.md" else file.name
         (PAGES / name).write_text(adapted(file.read_text()))
+    (PAGES / "notebook.md").write_text(adapted(notebook(PAGES / "notebook-files")))
     (PAGES / "settings-reference.md").write_text(settings_reference())
     (PAGES / "style.css").write_text(STYLE)
     (PAGES / "commands.md").write_text(command_reference())
@@ -199,5 +224,5 @@ def write_pages() -> None:
 if __name__ == "__main__":
     write_pages()
     (PAGES / "gallery.md").write_text(gallery())
-    subprocess.run([sys.executable, "-m", "mkdocs", "build", "--clean", "--strict"], cwd=ROOT, check=True)
+    subprocess.run([sys.executable, "-m", "zensical", "build", "--clean", "--strict"], cwd=ROOT, check=True)
     print("Open site/index.html")

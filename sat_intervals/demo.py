@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 Arrays = Sequence[Array]
 Profile = tuple[int, Array, Array, Array]  # row; ground column (px), height (m) and radiance of its nodes
+# What is new at a later date: row, column and half side (px) of squares, and metres by which they rise.
+Blocks = Sequence[tuple[float, float, float, float]]
 
 VIEWS = (-0.4, 0.6)  # a of the left and the right view, px per metre
 DATUM, PIXEL = 12.0, 0.5  # m: the height of disparity 0, the size of a pixel
@@ -84,6 +86,7 @@ class Ground:
     size: float
     low: float  # noise at the foot of the mountain, and at its top
     high: float
+    blocks: Blocks
 
     @property
     def margin(self) -> int:
@@ -101,10 +104,10 @@ class Ground:
         return np.asarray(self.relief * share * (1 - valley))
 
 
-def _ground_of(rows: int, columns: int, seed: int, relief: float) -> Ground:
+def _ground_of(rows: int, columns: int, seed: int, relief: float, blocks: Blocks) -> Ground:
     """Return the ground of a scene, whose mountain is `relief` m high within the image."""
     lattice = np.pad(np.random.default_rng([seed, 0]).uniform(-1, 1, (256, 256)), (0, 1), mode="wrap")
-    ground = Ground(lattice, relief, max(rows, columns), 0, 1)
+    ground = Ground(lattice, relief, max(rows, columns), 0, 1, blocks)
     if not relief:
         return ground
     r, c = np.linspace(0, rows, SAMPLES)[:, None], np.linspace(0, columns, SAMPLES)[None]
@@ -122,17 +125,20 @@ def make_scene(
     psf: float = 0.6,
     snr: float = 95,
     block: int = 64,
+    date: int = 0,
+    blocks: Blocks = (),
 ) -> Scene:
     """Make a scene, `block` rows at a time, with blur `psf` (sigma, px) and signal to noise `snr` (inf: no noise).
 
-    `relief` is the height of a mountain (m) under the city; 1 m is a disparity of 1 px.
+    `relief` is the height of a mountain (m) under the city; 1 m is a disparity of 1 px. Images of another `date` have
+    other noise.
     """
     blur = _Blur.of(psf, columns)
     truth, visible = np.full((rows, columns), np.nan, np.float32), np.zeros((rows, columns), bool)
     starts = np.ceil(CORNER[1] * columns * (1 - np.arange(rows) / (CORNER[0] * rows))).clip(0).astype(int)
 
     def lines() -> Iterator[tuple[int, Array]]:
-        for profile in profiles(rows, columns, seed, blur.halo, block, relief):
+        for profile in profiles(rows, columns, seed, blur.halo, block, relief, blocks):
             (height, left, seen), (_, right, _) = (look(profile, view, blur.at) for view in (0, 1))
             if 0 <= (row := profile[0]) < rows:
                 truth[row] = (VIEWS[1] - VIEWS[0]) * (height[blur.centres] - DATUM)
@@ -142,7 +148,7 @@ def make_scene(
             yield row, np.stack([left, right])
 
     images = np.zeros((2, rows, columns), np.uint16)
-    for row, level in _exposed(lines(), blur, OFFSET, GAIN, snr, np.random.default_rng([seed, 1])):
+    for row, level in _exposed(lines(), blur, OFFSET, GAIN, snr, np.random.default_rng([seed, 1, date])):
         images[:, row, starts[row] :] = level[:, starts[row] :]
     minimum, maximum = int(np.floor(np.nanmin(truth))) - SPARE, int(np.ceil(np.nanmax(truth))) + SPARE
     return Scene(images[0], images[1], truth, visible, minimum, maximum)
@@ -159,20 +165,22 @@ def make_views(
     snr: float = 95,
     change: float = 0.1,
     block: int = 64,
+    date: int = 0,
+    blocks: Blocks = (),
 ) -> tuple[Array, Array]:
     """Return raw images of many views, `(views, rows, columns)` uint16, and the heights (m) of the ground below them.
 
     A view shows `x = u + slant * (height - DATUM)`, in px per metre; it has its own contrast, noise, and a smooth
-    change of the ground's brightness by up to `change`, as between dates. Heights, `(rows, columns)` float32, are
-    those of the highest points above pixel centres.
+    change of the ground's brightness by up to `change`, as between dates; another `date` has others. Heights, `(rows,
+    columns)` float32, are those of the highest points above pixel centres.
     """
-    random = np.random.default_rng([seed, 2])
+    random = np.random.default_rng([seed, 2, date])
     blur, count = _Blur.of(psf, columns), len(slants)
     lattices = random.uniform(-1, 1, (count, 256, 256))
     heights = np.zeros((rows, columns), np.float32)
 
     def lines() -> Iterator[tuple[int, Array]]:
-        for profile in profiles(rows, columns, seed, blur.halo, block, relief):
+        for profile in profiles(rows, columns, seed, blur.halo, block, relief, blocks):
             row = profile[0]
             if 0 <= row < rows:
                 heights[row] = shown(profile, 0.0, np.arange(columns, dtype=float))[0]
@@ -257,10 +265,10 @@ def _highest_crossing(x: Array, at: Array, slant: float) -> tuple[Array, Array]:
 
 
 def profiles(
-    rows: int, columns: int, seed: int = 0, halo: int = 0, block: int = 64, relief: float = 0
+    rows: int, columns: int, seed: int = 0, halo: int = 0, block: int = 64, relief: float = 0, blocks: Blocks = ()
 ) -> Iterator[Profile]:
     """Yield the lit surface of rows -halo to rows + halo - 1, with a margin of MARGIN px or more on either side."""
-    ground = _ground_of(rows, columns, seed, relief)
+    ground = _ground_of(rows, columns, seed, relief, blocks)
     grid = np.arange((columns + 2 * ground.margin) * OVER) / OVER - ground.margin
     shade = np.full(grid.size, -np.inf)  # m, the height of the shadow of the rows above
     for first in range(-MARGIN, rows + halo, block):
@@ -291,7 +299,12 @@ def _surface(ground: Ground, rows: Array, columns: int) -> Array:
         near, frame = _place(ground, r[y, 0], c[0, x], [v[y, x] for v in quarter], salt, item)
         y, x = y[near], x[near]
         nodes[:2, y, x] = _draw(nodes[:, y, x], frame, item)
-    return nodes[:2].reshape(2, rows.size, -1)
+    surface = nodes[:2].reshape(2, rows.size, -1)
+    columns_of = np.arange(surface.shape[2]) / OVER - margin
+    for row, column, half, rise in ground.blocks:
+        inside = (np.abs(rows - row + 0.5) < half)[:, None] & (np.abs(columns_of - column + 0.5) < half)
+        surface[0] += rise * inside
+    return np.asarray(surface)
 
 
 def _ground(lattice: Array, r: Array, c: Array, grain: Array, quarter: Arrays) -> Array:

@@ -125,3 +125,14 @@ def test_make_views__show_the_ground_at_the_columns_of_its_heights(slant):
         inside = (there > 3) & (there < 256) & is_flat  # far from walls, which hide ground
         alike.append((nadir[inside], np.interp(there, columns, slanted)[inside]))
     assert np.corrcoef(*np.concatenate(alike, axis=1))[0, 1] > 0.99
+
+
+def test_make_views__a_later_date_has_other_noise_and_its_blocks():
+    (images, heights), (again, raised) = (
+        make_views(60, 90, [-0.3, 0.3], seed=5, date=date, blocks=blocks)
+        for date, blocks in ((0, ()), (1, [(30, 40, 5, 6.0)]))
+    )
+    rise = np.zeros_like(heights)
+    rise[25:35, 35:45] = 6
+    np.testing.assert_allclose(raised - heights, rise, atol=1e-5)
+    assert not np.array_equal(images[:, :10], again[:, :10])

@@ -1,5 +1,6 @@
 """The documents: README stays short, links lead somewhere, code cites sections that exist, commands and code run."""
 
+import json
 import re
 import shlex
 import shutil
@@ -8,6 +9,8 @@ import sys
 from collections.abc import Iterator
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -118,6 +121,7 @@ def test_commands__have_arguments_and_options_that_exist() -> None:
         name, *words = shlex.split(line)[1:]
         assert name in main.commands, (document, line)
         main.commands[name].make_context(name, words)  # raises for what it does not know
+    assert {shlex.split(line)[1] for document, line in found if document == "gallery.md"} == main.commands.keys()
 
 
 # What a machine of tests lacks, or what takes long, and where it is tried instead.
@@ -243,14 +247,38 @@ def _write_lidar(place: Path) -> None:
             file.write(lidar.astype(np.float32), 1)
 
 
-def test_site__has_a_page_for_every_document_and_every_setting() -> None:
-    spec = spec_from_file_location("documentation_site", ROOT / "docs" / "site.py")
+def module_of(name: str) -> ModuleType:
+    """Return a script of docs/ as a module."""
+    spec = spec_from_file_location(f"docs_{name}", ROOT / "docs" / f"{name}.py")
     assert spec
     assert spec.loader
-    site = module_from_spec(spec)
-    spec.loader.exec_module(site)
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.peer("matplotlib", "shareloc")
+@pytest.mark.usefixtures("thinned")
+def test_notebook__runs_and_prints_what_it_has_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In less than a minute on two cores, compilation apart; numbers may differ between processors."""
+    monkeypatch.chdir(tmp_path)
+    file = ROOT / "docs" / "notebook.ipynb"
+    stored = json.loads(file.read_text())
+    made = module_of("run_notebook").executed(stored)
+
+    def said(notebook: dict[str, Any]) -> list[str]:
+        outputs = [output for cell in notebook["cells"] for output in cell.get("outputs", [])]
+        return [re.sub(r"-?[\d.]+", "#", "".join(one.get("text", "picture"))) for one in outputs]
+
+    assert said(made) == said(stored)
+    assert said(made).count("picture") == 5
+    assert file.stat().st_size < 400_000
+
+
+def test_site__has_a_page_for_every_document_and_every_setting() -> None:
+    site = module_of("site")
     listed = set(re.findall(r"([\w-]+\.md)", (ROOT / "mkdocs.yml").read_text()))
-    made = {"index.md", "gallery.md", "commands.md", "settings-reference.md", "python-reference.md", "CHANGELOG.md"}
+    made = {"index.md", "notebook.md", "commands.md", "settings-reference.md", "python-reference.md", "CHANGELOG.md"}
     assert listed == made | {document.name for document in DOCUMENTS} - {"README.md"}
     settings = site.settings_reference()
     for name, field in Config.model_fields.items():

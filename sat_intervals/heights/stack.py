@@ -29,9 +29,10 @@ except ModuleNotFoundError as error:
 _TILE, _OVERLAP = 256, 16
 # Share of the cells of a level, of lowest confidence, that neither ranges nor shifts are made of.
 _UNSURE = 0.02, 0.3
-# Cells of a level around a block of the next one that its range is made of, and the margin of the range: steps of the
-# level, and a share of the range. With 4 cells whole roofs were lost that end beyond a block.
-_BESIDE, _MARGIN = 16, (2, 0.1)
+# Cells of a level around a block of the next one that its range is made of, by how much finer that is, and the margin
+# of the range: steps of the level, and a share of the range. Levels with large cells smooth narrow towers away: their
+# heights come from what is beside. With 4 cells whole roofs were lost that end beyond a block.
+_BESIDE, _MARGIN = {4: 32, 2: 10}, (2, 0.1)
 _SPECKLE = 30  # cells of a level of one surface, at least, that ranges are made of: fewer are stray winners
 # Sample blocks for shifts along each side of the grid, of the cells and of coarse levels, and their side in cells.
 _SAMPLES, _SIDE = (3, 2), 96
@@ -123,10 +124,10 @@ def ranges_for(surface: Surface, stack: Stack, finer: Stack, factor: int) -> Loc
     disparity = median(surface.disparity, sure, 3)
     rows, columns = (-(-size // BLOCK) for size in finer.ground.shape)
     least, most = np.full((2, rows, columns), np.nan)
-    side = BLOCK // factor
+    side, beside = BLOCK // factor, _BESIDE[factor]
     for row in range(rows):
         for column in range(columns):
-            around = Window(row * side, column * side, side, side).grown(_BESIDE, _BESIDE).clipped(stack.whole)
+            around = Window(row * side, column * side, side, side).grown(beside, beside).clipped(stack.whole)
             here = disparity[around.slices][sure[around.slices]]
             if here.size:
                 least[row, column], most[row, column] = here.min(), here.max()

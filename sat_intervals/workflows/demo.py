@@ -30,21 +30,29 @@ def slants_of(count: int) -> np.ndarray:
     return np.linspace(-half, half, count) / PIXEL
 
 
-def errors_of(count: int, seed: int) -> np.ndarray:
+def errors_of(count: int, seed: int, date: int = 0) -> np.ndarray:
     """Return rows and columns by which models are off, ``(views, 2)`` pixels, with mean 0."""
-    errors = np.random.default_rng([seed, 3]).normal(0, ERROR, (count, 2))
+    errors = np.random.default_rng([seed, 3, date]).normal(0, ERROR, (count, 2))
     return np.asarray(errors - errors.mean(axis=0))
 
 
 def write_views(
-    folder: Path, rows: int, columns: int, count: int, seed: int = 0, *, overwrite: bool = False, **scene: Any
+    folder: Path,
+    rows: int,
+    columns: int,
+    count: int,
+    seed: int = 0,
+    *,
+    date: int = 0,
+    overwrite: bool = False,
+    **scene: Any,
 ) -> tuple[list[Path], Path]:
     """Write raw images with RPC models that are off, and the true heights; return their paths.
 
-    ``scene`` are further arguments of `make_views`. What is there already is kept.
+    ``scene`` and ``date`` are further arguments of `make_views`. What is there already is kept.
     """
-    slants, errors = slants_of(count), errors_of(count, seed)
-    images, heights = make_views(rows, columns, slants.tolist(), seed, **scene)
+    slants, errors = slants_of(count), errors_of(count, seed, date)
+    images, heights = make_views(rows, columns, slants.tolist(), seed, date=date, **scene)
     reach = _REACH + float(np.abs(heights).max())
     nodes = np.meshgrid(np.linspace(0, rows, 7), np.linspace(0, columns, 7), DATUM + reach * np.linspace(-1, 1, 3))
     row, column, height = (axis.ravel() for axis in nodes)

@@ -13,7 +13,6 @@ import os
 import sys
 from functools import cache
 from pathlib import Path
-from unittest import mock
 
 import numpy as np
 import rasterio
@@ -22,7 +21,7 @@ from scipy.ndimage import gaussian_filter
 
 import sat_intervals
 from sat_intervals import demo, match_pair
-from sat_intervals.demo import OVER, PIXEL
+from sat_intervals.demo import PIXEL
 from sat_intervals.evaluate.change import open_pair
 from sat_intervals.evaluate.change_areas import ChangedAreas, signs_of
 from sat_intervals.heights.geometry import set_geometry
@@ -46,7 +45,6 @@ OPEN = 3.0  # metres: range of heights around a block
 SCENES = {0.3: (-0.2, 0.4), 0.5: (-0.4, 0.6), 0.8: (-0.6, 1.0)}
 SHIFTED = -0.6  # left view of the second pair, as a share of the distance between both
 SEEDS = range(10)
-SURFACE, RANDOM = demo._surface, np.random.default_rng
 
 
 def surface_of(images):
@@ -92,7 +90,7 @@ def stable():
 @cache
 def blocks_of(seed):
     """Blocks on open ground of a scene: row, column and half side in px, and height in m."""
-    demo._surface, columns = SURFACE, np.arange(SIZE, dtype=float)
+    columns = np.arange(SIZE, dtype=float)
     heights = np.stack([demo.shown(one, 0.0, columns)[0] for one in demo.profiles(SIZE, SIZE, seed)])
     random, found = np.random.default_rng(seed), []
     for row, column in random.integers(APART, SIZE - APART, (3000, 2)).tolist():
@@ -104,20 +102,6 @@ def blocks_of(seed):
     return [(*one, 1 + rise % 10) for one, rise in zip(found, random.permutation(len(found)).tolist(), strict=True)]
 
 
-def with_blocks(seed):
-    """Return `demo._surface` with blocks on the ground."""
-
-    def surface(ground, rows, columns):
-        height, albedo = SURFACE(ground, rows, columns)
-        column = np.arange(height.shape[1]) / OVER - ground.margin
-        for middle, centre, half, rise in blocks_of(seed):
-            inside = (np.abs(rows - middle + 0.5) < half)[:, np.newaxis] & (np.abs(column - centre + 0.5) < half)
-            height = height + rise * inside
-        return np.stack([height, albedo])
-
-    return surface
-
-
 def scene_pair(ratio, seed, is_after):
     """Surface of a scene of a date."""
     out = BUILD / f"scene_{ratio}_{seed}_{'after' if is_after else 'before'}"
@@ -125,15 +109,8 @@ def scene_pair(ratio, seed, is_after):
     views = (SHIFTED * (right - left), (1 + SHIFTED) * (right - left)) if is_after else (left, right)
     if (out / "out" / "dsm.tif").exists():
         return out / "out"
-    blocks_of(seed)
     demo.VIEWS = views
-    demo._surface = with_blocks(seed) if is_after else SURFACE
-
-    def random(given):
-        return RANDOM([*given, 1] if is_after and given[1] == 1 else given)
-
-    with mock.patch.object(np.random, "default_rng", random):
-        scene = demo.make_scene(SIZE, SIZE, seed)
+    scene = demo.make_scene(SIZE, SIZE, seed, date=int(is_after), blocks=blocks_of(seed) if is_after else ())
     place = north_up(32631, x=370_000, y=4_830_000, pixel=PIXEL)
     out.mkdir(parents=True, exist_ok=True)
     for name, image in (("left", scene.left), ("right", scene.right)):

@@ -34,8 +34,8 @@ def test_main__alone_shows_commands_of_every_day_by_step():
     steps = [line.rstrip(":") for line in lines if line.endswith(":")]
     assert steps == [*STEPS]
     shown = [line.split()[0] for line in lines if line.startswith("  ") and line[2] != " "]
-    heights = ["surface", "dsm"]
-    assert shown == ["demo", "match", "status", "report", "project", *heights, "evaluate", "export"]
+    heights = ["surface", "change", "dsm"]
+    assert shown == ["demo", *heights, "match", "status", "report", "project", "evaluate", "export"]
     assert "sat-intervals --help lists all" in " ".join(lines)
 
 
