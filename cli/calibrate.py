@@ -58,7 +58,8 @@ def calibrate(
     pair is split into 16 blocks, and each block is evaluated with the levels found on the other 15.
 
     With --dsm: find margins in metres, so that the intervals of a surface model contain the required share of the
-    heights of --reference (its own coverage, or --coverage). Use FILE with: dsm --calibration FILE.
+    heights of --reference (its own coverage, or --coverage). Use FILE with: dsm --calibration FILE; of three images or
+    more: surface --height-calibration FILE.
     """
     if surface is not None:
         calibrate_heights(surface, output, name, coverage, printing, overwrite=overwrite)

@@ -14,7 +14,7 @@ from sat_intervals.cli.options import FILE, log_options, truth_option
 def report(out: Path, truth: Path | None) -> None:
     """Write OUT/report.html, one self-contained file for any browser.
 
-    It shows maps, the interval profile of any row, histograms, validity, tiles and seams, settings and times. With a
+    It shows maps, the interval profile of any row, histograms, validity, tiles, settings and times. With a
     truth, it also shows how often the intervals contain it; with dsm.tif, hillshade, half widths and completeness. For
     large images, maps and profiles show every n-th row and column. Of a folder of `change` it has its figures and, once
     `plot` has drawn it, the map. Of the folder of a batch each pair that is done gets its page.
