@@ -45,6 +45,7 @@ def figures(out, truth, classes=None):
         place, shape = comparison.cells(window, comparison.finer)
         kinds = read_heights(classes, place, shape, Window(0, 0, *shape))[known]
         parts |= {name: kinds == kind for name, kind in CLASSES.items()}
+        parts |= {f"south {name}": parts[name] & parts["south"] for name in CLASSES}
     nmad = 1.4826 * np.median(np.abs(height - reference - np.median(height - reference)))
     covered = "  ".join(
         f"{name} {inside[part].mean():.3f} +-{np.median((upper - lower)[part]) / 2:.2f}" for name, part in parts.items()
