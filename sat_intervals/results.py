@@ -66,6 +66,10 @@ class Run:
     region: Window
     georeferencing: Georeferencing
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what workers need: a report with local ranges is large."""
+        return self.__dict__ | {"report": {}}
+
     @property
     def bands(self) -> Mapping[str, Sequence[int]]:
         """Return the files of the run with the indices of the bands of `Bands`."""

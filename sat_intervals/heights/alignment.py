@@ -48,10 +48,11 @@ def aligned(
         around = core.grown(REACH + 1, REACH + 1)
         extent = cells.extent(around).grown(radius)
         arguments.append(([one.near(extent) for one in heights_only], cells, crs, radius, reference, around))
-    blocks = dict(each(_parts, arguments, "alignment"))
+    blocks = dict(each(_heights, arguments, "alignment"))
+    inner = slice(REACH + 1, -REACH - 1)
     found = {
-        pair: [blocks[number][place] for number in range(len(cores))]
-        for place, pair in enumerate(combinations(range(count), 2))
+        (one, other): [part_of(blocks[n][one], blocks[n][other][inner, inner]) for n in range(len(cores))]
+        for one, other in combinations(range(count), 2)
     }
     pairs = {pair: register(put_together(parts, cells.resolution, moves=-1)) for pair, parts in found.items()}
     known = {pair: one for pair, one in pairs.items() if one}
@@ -72,10 +73,10 @@ def aligned(
     return moved, report
 
 
-def _parts(
+def _heights(
     clouds: Sequence[PointCloud], cells: Cells, crs: str, radius: float, reference: Path | None, around: Window
-) -> list[tuple[np.ndarray, ...]]:
-    """Return what registers each two of all runs and the reference on a block and around it; runs on a worker."""
+) -> list[np.ndarray]:
+    """Return the heights of all runs and the reference on a block and around it; runs on a worker."""
     # float32, since those of all blocks are kept; NaN where there is no height
     heights = [mean_heights(cloud.splat(cells, around, radius)[0]).astype(np.float32) for cloud in clouds]
     if reference:
@@ -83,8 +84,7 @@ def _parts(
         shape = around.height, around.width
         known = read_heights(reference, place, shape, Window(0, 0, *shape), smooth=True)
         heights.append(np.where(is_ground(known), known, np.nan).astype(np.float32))
-    inner = slice(REACH + 1, -REACH - 1)
-    return [part_of(one, other[inner, inner]) for one, other in combinations(heights, 2)]
+    return heights
 
 
 def solved(

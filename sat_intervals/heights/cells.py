@@ -81,8 +81,10 @@ def rows_of_cells(rows: Window, around: Window, tiles: Sequence[Tile], how: Grid
     measured = np.isfinite(made[0]).sum()
     remove_poor_cells(bands, None, choices.min_confidence)
     if choices.calibration:
-        height, lower, upper = bands[:3]
-        bands[1:3] = Margins(*choices.calibration.table()).widened(height, lower, upper, relief_of(height))
+        margins, relief = Margins(*choices.calibration.table()), relief_of(bands[0])
+        for part in _parts(around.width):
+            height, lower, upper = bands[:3, :, part]
+            bands[1:3, :, part] = margins.widened(height, lower, upper, relief[:, part])
     remove_poor_cells(bands, choices.max_width, None)
     counts["poor_cells"] = int(measured - np.isfinite(made[0]).sum())
     return [made], counted(made, counts)
@@ -158,15 +160,23 @@ def remove_poor_cells(bands: np.ndarray, max_width: float | None, min_confidence
 
 def counted(bands: np.ndarray, counts: Counter[str]) -> dict[str, Any]:
     """Return numbers of cells beside ``counts`` of their points, and numbers of their widths in steps."""
-    height, lower, upper, *_, agreement = bands
-    width = upper - lower
-    width = width[np.isfinite(width)]
-    known = {"filled": np.isfinite(height), "shared": np.isfinite(agreement), "disagreeing": agreement == 0}
-    known |= {"bounded": np.isfinite(width), "wide": width >= 2 * WIDE}
-    steps = np.bincount(np.clip(np.rint(width * _STEPS), 0, _WIDEST * _STEPS).astype(np.int64))
-    found = np.flatnonzero(steps).tolist()
-    widths = dict(zip(map(str, found), steps[found].tolist(), strict=True))
-    return {"counts": counts | {name: int(np.count_nonzero(of)) for name, of in known.items()}, "widths": widths}
+    counts, widths = Counter(counts), Counter[str]()
+    for part in _parts(bands.shape[2]):
+        height, lower, upper, *_, agreement = bands[:, :, part]
+        width = upper - lower
+        width = width[np.isfinite(width)]
+        known = {"filled": np.isfinite(height), "shared": np.isfinite(agreement), "disagreeing": agreement == 0}
+        known |= {"bounded": np.isfinite(width), "wide": width >= 2 * WIDE}
+        counts.update({name: int(np.count_nonzero(of)) for name, of in known.items()})
+        steps = np.bincount(np.clip(np.rint(width * _STEPS), 0, _WIDEST * _STEPS).astype(np.int64))
+        found = np.flatnonzero(steps).tolist()
+        widths.update(dict(zip(map(str, found), steps[found].tolist(), strict=True)))
+    return {"counts": dict(counts), "widths": dict(widths)}
+
+
+def _parts(width: int) -> list[slice]:
+    """Return columns that are worked on at a time: memory beside the bands stays small."""
+    return [slice(first, min(first + _TILE, width)) for first in range(0, width, _TILE)]
 
 
 def report_of(noted: Iterable[Mapping[str, Any]], cells: int) -> dict[str, Any]:

@@ -90,7 +90,7 @@ class Lattice:
         """Return the rows and columns of the nodes around a window, of those that there are."""
         ends = (window.row, window.row_stop - 1), (window.column, window.column_stop - 1)
         rows, columns = (
-            slice(max(0, min(int(first / step) - start, count - 2)), min(int(last / step) + 2 - start, count))
+            slice(max(0, min(int(first / step) - start, count - 2)), max(2, min(int(last / step) + 2 - start, count)))
             for (first, last), step, count, start in zip(
                 ends, self.spacing, self.nodes.shape[:2], self.first, strict=False
             )

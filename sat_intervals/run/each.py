@@ -1,5 +1,7 @@
 """Calls of many blocks, and files of many rows, on workers."""
 
+import logging
+import platform
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -7,7 +9,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from sat_intervals.config import Cluster
-from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.errors import InputError, RunError, SatIntervalsError
 from sat_intervals.prepare.pair import RowArguments, Rows
 from sat_intervals.progress import Progress
 from sat_intervals.raster import BLOCK, OutputWriter, RemotePath
@@ -27,10 +29,12 @@ from sat_intervals.run.workers import (
 )
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import digest
-from sat_intervals.store.tiles import NO_TILES, Store
+from sat_intervals.store.tiles import NO_TILES, PARTS, Store
 from sat_intervals.tiling import Window
 
 _RETRIES = 2
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,8 @@ class EachOnWorkers:
         tasks = (Task(i, _called, (function, each), _RETRIES) for i, each in enumerate(arguments))
 
         def failed(_: int, error: BaseException) -> NoReturn:
+            if isinstance(error, InputError):
+                raise error
             raise RunError(f"{_FOUND[stage]} could not be found: {reason(error)}") from error
 
         self.progress(stage, 0, len(arguments))
@@ -61,7 +67,9 @@ class EachOnWorkers:
         assert isinstance(connection, Connection)
         cluster = with_store(connection.settings, writer.folder)
         store = cluster.store
-        place = f"{store}/{digest(str(first))}" if store else first.with_name(f".{first.name}.parts")
+        # others may have a folder of this name, and the same store
+        name = str(first) if isinstance(first, RemotePath) else f"{platform.node()} {first.absolute()}"
+        place = f"{store}/{digest(name)}" if store else first.with_name(f".{first.name}.parts")
         run = uuid.uuid4().hex  # parts of a command that died are not used again
         parts = Parts(Store(folder_at(place), NO_TILES, run), files, shape, run, codecs_of(files), cluster.retries)
         if not store:
@@ -80,11 +88,14 @@ class EachOnWorkers:
         def look(done: int) -> None:
             self.progress(stage, min(shape[0], BLOCK * done), shape[0])
 
-        parts.store.remove()
-        connection.at_end.callback(parts.store.remove)  # once no worker writes any more
-        noted = finish_parts(parts, connection, row, failed, look)
-        copy_parts(parts, noted, writer, None if store else connection, self.progress)
-        parts.store.remove()
+        _remove(parts)
+        try:
+            noted = finish_parts(parts, connection, row, failed, look)
+            copy_parts(parts, noted, writer, None if store else connection, self.progress)
+        except BaseException:
+            connection.at_end.callback(_remove, parts)  # once no worker writes any more
+            raise
+        _remove(parts)
         return [noted[0, number]["noted"] for number in range(parts.rows[0])]
 
 
@@ -93,6 +104,13 @@ def pool_of(connection: Connection, out: Path, progress: Progress) -> EachOnWork
     cluster = connection.settings
     is_shared = cluster.kind in ("threads", "processes") or isinstance(out, RemotePath) or not is_remote(cluster)
     return EachOnWorkers(connection if is_shared else connection.enter_context(Connection(Cluster(), out)), progress)
+
+
+def _remove(parts: Parts) -> None:
+    try:
+        parts.store.remove([PARTS])
+    except OSError as error:  # the files are whole, or another error is on its way
+        _LOG.warning("parts of files stay in %s: %s", parts.store.folder, reason(error))
 
 
 def _write_row(

@@ -6,7 +6,7 @@ import logging
 import signal
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError, Future
 from contextlib import contextmanager
 from pathlib import Path
@@ -128,9 +128,8 @@ def _scheduler_errors() -> Iterator[None]:
 def connected(settings: Cluster, out: Path) -> Iterator[Client]:
     """Connect a client to the cluster of the settings; close it, and what it started, at the end."""
     logs_all = logging.getLogger("sat_intervals").isEnabledFor(logging.DEBUG)
-    for name in () if logs_all else ("distributed", "distributed.client"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)  # after shareloc the root logger would print all of it
-    with dask.config.set(DASK), _client(settings, out) as client:
+    quiet = () if logs_all else ("distributed", "distributed.client")
+    with _silenced(quiet), dask.config.set(DASK), _client(settings, out) as client:
         _LOG.info("connected to %s", client)
         if settings.kind == "processes":
             client.register_worker_callbacks(_ignore_interrupts)
@@ -140,6 +139,19 @@ def connected(settings: Cluster, out: Path) -> Iterator[Client]:
                 client.forward_logging(name)
         yield client
     _LOG.info("disconnected")
+
+
+@contextmanager
+def _silenced(names: Sequence[str]) -> Iterator[None]:
+    """Keep lines of loggers away: after shareloc the root logger would print them."""
+    levels = {logging.getLogger(name): logging.getLogger(name).level for name in names}
+    try:
+        for logger in levels:
+            logger.setLevel(logging.CRITICAL)
+        yield
+    finally:
+        for logger, level in levels.items():
+            logger.setLevel(level)
 
 
 def _ignore_interrupts() -> None:
