@@ -122,7 +122,10 @@ def _write_row(
         write_part(parts, key, rasters, noted=noted)
 
 
-_FOUND = {"range": "the search range", "rows": "row offsets", "images": "mean and deviation of the images"} | {
+_FOUND = {
+    "range": "the search range",
+    "rows": "row offsets",
+    "images": "mean and deviation of the images",
     "heights": "the heights of the ground",
     "shifts": "the shifts of the images",
     "extent": "the extent of the surface",

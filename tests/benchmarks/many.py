@@ -1,7 +1,8 @@
 """The table of docs/many.md (`make many-bench`): surfaces of many images and of pairs of them; five minutes.
 
 Images of jax_068 in SAT_INTERVALS_SHARED against LiDAR of the west half, whose north half the calibration has seen, and
-views of towns with exact truth, which it has not. Surfaces are made anew, in `build/many`, and registered.
+views of towns with exact truth, which it has not. Surfaces are made anew, in `build/many`, and registered;
+seconds are those of matching, the first ones with compilation.
 """
 
 import os
@@ -25,11 +26,6 @@ CLASSES = {"ground": 2, "roofs": 6, "trees": 5}
 # Views, seeds and noise of towns, and their side in pixels.
 TOWNS = [(views, seed, {"snr": 60} if seed % 2 else {}) for views in (3, 5, 8) for seed in (21, 22, 31, 32)]
 SIDE = 420
-
-
-def matched(images, out):
-    """Make a surface; return seconds, without compilation and imports if another was made before."""
-    return surface(images, out, resolution=PIXEL, overwrite=True)
 
 
 def figures(out, truth, classes=None):
@@ -56,7 +52,8 @@ def figures(out, truth, classes=None):
 def jacksonville(images):
     """Print the line of some images of jax_068, by their numbers."""
     out = BUILD / images.replace(" ", "_")
-    report = matched([open_image(DATA / f"{one}.tif", band=2) for one in images.split()], out)
+    opened = [open_image(DATA / f"{one}.tif", band=2) for one in images.split()]
+    report = surface(opened, out, resolution=PIXEL, overwrite=True)
     seconds = report["seconds"]["total"] if "seconds" in report else report["run"]["seconds"]["total"]
     show(images, figures(out, DATA / "lidar_west.tif", DATA / "classes_west.tif"), seconds)
 
@@ -64,7 +61,7 @@ def jacksonville(images):
 def town(views, seed, more):
     """Print the line of a scene of our own."""
     paths, truth = write_views(BUILD / f"{views}_{seed}", SIDE, SIDE, views, seed, **more)
-    report = matched(paths, BUILD / "town")
+    report = surface(paths, BUILD / "town", resolution=PIXEL, overwrite=True)
     found = figures(BUILD / "town", truth)
     show(f"{views} views, seed {seed}", found, report["seconds"]["total"])
 
