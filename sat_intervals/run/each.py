@@ -6,10 +6,9 @@ import uuid
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from sat_intervals.config import Cluster
-from sat_intervals.errors import InputError, RunError, SatIntervalsError
 from sat_intervals.prepare.pair import RowArguments, Rows
 from sat_intervals.progress import Progress
 from sat_intervals.raster import BLOCK, OutputWriter, RemotePath
@@ -19,8 +18,6 @@ from sat_intervals.run.parts import PartKey, Parts, codecs_of, copy_parts, finis
 from sat_intervals.run.state import with_store
 from sat_intervals.run.workers import (
     Task,
-    Workers,
-    check_not_full,
     computing,
     is_remote,
     picklable_errors,
@@ -41,7 +38,7 @@ _LOG = logging.getLogger(__name__)
 class EachOnWorkers:
     """Calls functions on workers, a bounded number at a time; a `prepare.pair.Each`, and a `Pool`."""
 
-    workers: Workers
+    workers: Connection
     progress: Progress
 
     def __call__(
@@ -50,10 +47,8 @@ class EachOnWorkers:
         """Yield results with the number of their arguments, as they come."""
         tasks = (Task(i, _called, (function, each), _RETRIES) for i, each in enumerate(arguments))
 
-        def failed(_: int, error: BaseException) -> NoReturn:
-            if isinstance(error, InputError):
-                raise error
-            raise RunError(f"{_FOUND[stage]} could not be found: {reason(error)}") from error
+        def failed(_: int) -> str:
+            return f"{_FOUND[stage]} could not be found"
 
         self.progress(stage, 0, len(arguments))
         return results(self.workers, tasks, failed, lambda done: self.progress(stage, done, len(arguments)))
@@ -64,7 +59,6 @@ class EachOnWorkers:
         """Write files of parts that workers make, see `Pool`; the parts are beside the files, or in the store."""
         files, shape, whole = writer.files, writer.shape, Window(0, 0, *writer.shape)
         connection, first = self.workers, writer.folder / files[0].name
-        assert isinstance(connection, Connection)
         cluster = with_store(connection.settings, writer.folder)
         store = cluster.store
         # others may have a folder of this name, and the same store
@@ -79,11 +73,8 @@ class EachOnWorkers:
             window = Window(BLOCK * key[1], 0, BLOCK, shape[1]).clipped(whole)
             return _write_row, (parts, key, cluster, function, arguments(window))
 
-        def failed(_: PartKey, error: BaseException) -> NoReturn:
-            check_not_full(error, writer.folder)
-            if isinstance(error, SatIntervalsError):
-                raise error
-            raise RunError(f"{first} could not be written: {reason(error)}; rerun the same command") from error
+        def failed(_: PartKey) -> str:
+            return f"{first} could not be written"
 
         def look(done: int) -> None:
             self.progress(stage, min(shape[0], BLOCK * done), shape[0])

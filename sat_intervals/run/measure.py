@@ -31,7 +31,6 @@ from sat_intervals.run.inputs import check_unchanged, describe_inputs
 from sat_intervals.run.job import Job, job_of
 from sat_intervals.run.pair import check_failures, match_jobs
 from sat_intervals.run.strips import raw_rows
-from sat_intervals.run.workers import Workers
 from sat_intervals.store.lock import locked
 from sat_intervals.tiling import Window
 
@@ -111,7 +110,7 @@ def _of_all(progress: Progress, stage: str, number: int, total: int, *_: object)
 
 
 def _of_scene(
-    workers: Workers,
+    workers: Connection,
     scene: CalibrationScene,
     thresholds: ThresholdSweep,
     folder: Path,

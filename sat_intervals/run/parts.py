@@ -5,19 +5,18 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, nullcontext
 from dataclasses import dataclass
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
-from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.errors import RunError
 from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.match import postprocess, refinement
 from sat_intervals.progress import Progress
 from sat_intervals.raster import BLOCK, File, OutputWriter, Part, codec_versions, compressed, factors, halved
-from sat_intervals.run.workers import Task, Threads, Workers, picklable_errors, reason, results
+from sat_intervals.run.workers import Task, Threads, Workers, picklable_errors, results
 from sat_intervals.store.arrays import DamagedFileError
 from sat_intervals.store.manifest import digest
 from sat_intervals.store.tiles import PARTS, DamagedTilesError, Store
@@ -84,7 +83,7 @@ def finish_parts(
     parts: Parts,
     workers: Workers,
     row: Callable[[PartKey], tuple[Callable[..., str | None], tuple[Any, ...]]],
-    failed: Callable[[PartKey, BaseException], NoReturn],
+    failed: Callable[[PartKey], str],
     look: Callable[[int], None],
 ) -> dict[PartKey, dict[str, Any]]:
     """Make the parts that are missing; return ``meta`` of all.
@@ -183,7 +182,7 @@ def copy_parts(
                 Task(part.source, copy_part, (parts, *part.source, path.absolute(), offset), parts.retries)
                 for offset, part in of_file
             )
-            for _, name in results(copiers, tasks, partial(_fail, path), look):
+            for _, name in results(copiers, tasks, lambda _: f"a part of {path} could not be copied", look):
                 copied.append(name)
 
         look(0)
@@ -195,12 +194,6 @@ def copy_parts(
             writer.assemble(file.name, levels, copy)
     if damaged := sorted({name for name in copied if name}):
         raise parts.damaged(damaged)
-
-
-def _fail(path: Path, _: object, error: BaseException) -> NoReturn:
-    if isinstance(error, (OSError, SatIntervalsError)):
-        raise error
-    raise RunError(f"a part of {path} could not be copied: {reason(error)}") from error
 
 
 def copy_part(parts: Parts, key: PartKey, name: str, path: Path, offset: int) -> str | None:

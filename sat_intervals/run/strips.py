@@ -1,13 +1,11 @@
 """Finish strips of a run on workers: final bands, as parts of the files."""
 
 from collections.abc import Callable, Iterable, Iterator
-from functools import partial
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
 from sat_intervals.config import Config, HeightCalibration
-from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.kernels.conformal import AROUND, Margins, relief_of
 from sat_intervals.match.around import with_agreement
 from sat_intervals.match.ground import GroundViews
@@ -30,7 +28,7 @@ from sat_intervals.raster import BLOCK, read_views
 from sat_intervals.run.job import Job
 from sat_intervals.run.parts import PartKey, Parts, codecs_of, finish_parts, write_part
 from sat_intervals.run.state import files_of_run
-from sat_intervals.run.workers import Workers, check_not_full, computing, picklable_errors, reason
+from sat_intervals.run.workers import Workers, computing, picklable_errors
 from sat_intervals.store.tiles import DamagedTilesError
 from sat_intervals.tiling import Window
 
@@ -55,20 +53,13 @@ def finish_strips(
     def row(key: PartKey) -> tuple[Callable[..., str | None], tuple[Any, ...]]:
         return finish_strip, (job, parts, key, scale)
 
-    found = finish_parts(parts, workers, row, partial(_fail, job), look)
+    def failed(key: PartKey) -> str:
+        first, last = (min(height, BLOCK * (there << key[0])) for there in (key[1], key[1] + 1))
+        return f"rows {first} to {last - 1} could not be finished"
+
+    found = finish_parts(parts, workers, row, failed, look)
     progress("bands", height, height)
     return found
-
-
-def _fail(job: Job, key: PartKey, error: BaseException) -> NoReturn:
-    check_not_full(error, job.store.folder)
-    if isinstance(error, SatIntervalsError):  # names files and the way out
-        raise error
-    level, row = key
-    first, last = (min(job.store.grid.region.height, BLOCK * (there << level)) for there in (row, row + 1))
-    raise RunError(
-        f"rows {first} to {last - 1} could not be finished: {reason(error)}; rerun the same command: it resumes"
-    ) from error
 
 
 def finish_strip(job: Job, parts: Parts, key: PartKey, scale: ConfidenceScale) -> str | None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cache
 from queue import Empty, SimpleQueue
 from threading import BoundedSemaphore
-from typing import Any, NamedTuple, NoReturn, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from sat_intervals.config import Cluster, ConfigError
 from sat_intervals.errors import RunError, SatIntervalsError
@@ -50,15 +50,18 @@ class Workers(Protocol):
 def results(
     workers: Workers,
     tasks: Iterator[Task | None],
-    failed: Callable[[Any, BaseException], NoReturn],
+    failed: Callable[[Any], str],
     look: Callable[[int], None],
 ) -> Iterator[tuple[Any, Any]]:
-    """Yield label and result of each task; ``failed`` raises for an error, ``look`` is given the number done."""
+    """Yield label and result of each task; ``failed`` says which one failed, ``look`` is given the number done."""
     done = 0
     for outcome in workers.outcomes(tasks):
         if outcome is not None:
-            if outcome.error is not None:
-                failed(outcome.label, outcome.error)
+            if (error := outcome.error) is not None:
+                check_not_full(error)
+                if isinstance(error, SatIntervalsError):  # names files and the way out
+                    raise error
+                raise RunError(f"{failed(outcome.label)}: {reason(error)}; rerun the same command") from error
             done += 1
             yield outcome.label, outcome.result
         look(done)
@@ -163,11 +166,11 @@ def tiles_at_once(settings: Cluster) -> int:
     return (settings.maximum_jobs or settings.jobs) * settings.cores
 
 
-def check_not_full(error: BaseException, place: object) -> None:
+def check_not_full(error: BaseException, place: object = "disk") -> None:
     """Raise if a task failed because the disk is full: all others would fail too."""
     if isinstance(error, OSError) and error.errno in _FULL_DISK:
         raise RunError(
-            f"{error.filename or place}: {error.strerror}: free disk space and rerun the same command: it resumes"
+            f"{error.filename or place}: {error.strerror}: free disk space and rerun the same command"
         ) from error
 
 
