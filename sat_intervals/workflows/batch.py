@@ -68,14 +68,14 @@ def match_batch(
     with locked(out), ExitStack() as stack:
         report = _Report(out, pairs)
         with Connection(common.cluster, out) as connection:
-            each = pool_of(connection, out, progress)
+            each, pool = EachOnWorkers(connection, progress), pool_of(connection, out, progress)
             jobs: dict[str, Job] = {}
             for number, pair in enumerate(pairs):
                 progress("pairs", number, len(pairs))
                 try:
                     own, count = merged(overrides or {}, pair.settings), len(pair.images)
                     settings = load_config(sections, own, preset_wins=True, file=file, images=count)
-                    if (job := surfaces.job(pair, settings, each, keep_tiles=keep_tiles)) is None:
+                    if (job := surfaces.job(pair, settings, each, pool, keep_tiles=keep_tiles)) is None:
                         report.note({pair.name: _ended("done before", open_run(out / pair.name).report)})
                         continue
                     stack.enter_context(locked(job.out))
@@ -91,7 +91,7 @@ def match_batch(
             for pair in pairs:
                 state = report.states[pair.name]
                 if pair.resolution and state["state"] != "failed":
-                    report.note({pair.name: state | surfaces.made(pair, each)})
+                    report.note({pair.name: state | surfaces.made(pair, pool)})
     return report.states
 
 
@@ -158,13 +158,15 @@ class _Surfaces:
                 self._errors[pair.name] = error
                 _LOG.warning("%s: there will be no surface: %s", pair.name, error)
 
-    def job(self, pair: PairOfBatch, settings: Config, each: EachOnWorkers, *, keep_tiles: bool) -> Job | None:
-        """Return what is to be matched of a row; None of more images whose surface is there."""
+    def job(
+        self, pair: PairOfBatch, settings: Config, each: EachOnWorkers, pool: EachOnWorkers, *, keep_tiles: bool
+    ) -> Job | None:
+        """Return what is to be matched of a row, rectified by a pool; None of more images whose surface is there."""
         out, overwrite = self._out / pair.name, self._overwrite
         if not pair.more:
             if pair.resolution and (choices := _choices(pair)).calibration:
                 check_cells(_cells(pair), choices, resolved(settings).interval)
-            images = self._epipolar(pair, out, each)
+            images = self._epipolar(pair, out, pool)
             how: dict[str, Any] = {"overwrite": overwrite, "pair": pair.name, "each": each}
             return open_job(*images, out, settings, window=_window(pair), **how)
         options: dict[str, Any] = {name: pair.options.get(name) for name in ("crs", "geoid", "extent", "heights")}
