@@ -1,6 +1,7 @@
 """``sat-intervals plan``: estimate tiles, memory, disk and time of a run."""
 
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -9,6 +10,7 @@ from sat_intervals.cli.dsm import grid_options, side_of
 from sat_intervals.cli.images import PairArguments, ground_options, many_options
 from sat_intervals.cli.matching import SettingsArguments, search_options
 from sat_intervals.cli.options import Grouped, json_option, log_options, say_json
+from sat_intervals.cli.rectify import model_options, raw_options
 
 if TYPE_CHECKING:
     from sat_intervals.config import Config
@@ -18,6 +20,8 @@ if TYPE_CHECKING:
 @click.command(cls=Grouped, short_help="Estimate tiles, memory, disk and time of a run.")
 @search_options
 @many_options
+@model_options
+@raw_options
 @grid_options
 @ground_options
 @click.option(
@@ -29,14 +33,18 @@ def plan(
     pair: PairArguments,
     settings: SettingsArguments,
     ground: dict[str, Any],
+    raw: dict[str, Any],
     memory: str | None,
     as_json: bool,
+    left_model: Path | None,
+    right_model: Path | None,
     **grid: Any,
 ) -> None:
-    """Estimate tiles, memory, disk and time of matching LEFT and RIGHT, or of the surface of three images or more.
+    """Estimate tiles, memory, disk and time of matching LEFT and RIGHT, or of a surface of two raw images or more.
 
-    The time comes from a sample matched at the centre, or elsewhere if there is no data. Options are those of match; of
-    three images or more those of surface, whose shifts, grid and heights are found.
+    The time comes from a sample matched at the centre, or elsewhere if there is no data. Options are those of match;
+    with --resolution or --grid-like those of surface. Of a raw pair the middle is resampled, and its search range
+    found; of three images or more shifts, grid and heights are found.
     """
     from sat_intervals.cli.console import Console, lines_of_grid
     from sat_intervals.run.workers import parse_memory
@@ -44,7 +52,8 @@ def plan(
     config = settings.load(2 + len(pair.more))
     limit = parse_memory(memory) if memory else None
     with Console(quiet=as_json) as console:
-        made = _planned(pair, config, grid | ground, memory=limit, progress=console.progress)
+        raw |= {"models": (left_model, right_model)}
+        made = _planned(pair, config, grid, ground, raw, memory=limit, progress=console.progress)
         if made.sweep:
             console.say_images(made.sweep)
     if as_json:
@@ -71,22 +80,35 @@ def plan(
         click.echo(f"{name + ':':<36}{value}")
 
 
-def _planned(pair: PairArguments, config: "Config", grid: dict[str, Any], **how: Any) -> "Plan":
-    """Plan the match of two images, or the surface of more on a grid."""
+def _planned(
+    pair: PairArguments, config: "Config", grid: dict[str, Any], ground: dict[str, Any], raw: dict[str, Any], **how: Any
+) -> "Plan":
+    """Plan the match of two images, or the surface of two raw images or more on a grid."""
     from sat_intervals.errors import check_absent
-
-    if not pair.more:
-        from sat_intervals.run.plan import plan as of_pair
-
-        check_absent({f"--{name.replace('_', '-')}": value for name, value in grid.items()}, "three images or more")
-        left, right = pair.open()
-        return of_pair(left, right, config, window=pair.window, **how)
+    from sat_intervals.run.plan import plan as of_pair
     from sat_intervals.workflows.many import Wanted
-    from sat_intervals.workflows.plan import plan_of_many
+    from sat_intervals.workflows.plan import plan_of_many, plan_of_raw
 
-    check_absent({"--window": pair.region}, "two images")
+    images, models = pair.open(), raw.pop("models")
+    raw_only = raw | {"left_model": models[0], "right_model": models[1]}
+    is_surface = pair.more or grid["resolution"] or grid["grid_like"]
+    if not pair.more:
+        check_absent(_options(ground), "three images or more")
+    if not is_surface:
+        check_absent(_options(grid | raw_only), "surfaces, with --resolution or --grid-like")
+        return of_pair(images[0], images[1], config, window=pair.window, **how)
+    check_absent({"--window": pair.region}, "epipolar images")
     side = side_of(grid.pop("resolution"), grid.pop("grid_like"))
-    return plan_of_many(pair.open(), config, Wanted(side, **grid), **how)
+    if pair.more:
+        check_absent(_options(raw_only), "two images")
+        return plan_of_many(images, config, Wanted(side, **grid, **ground), **how)
+    cells = grid | {"resolution": side, "radius": None}
+    raw |= {"geoid": grid["geoid"] if raw["dem"] else None}
+    return plan_of_raw(images, config, cells, raw, models, **how)
+
+
+def _options(given: dict[str, Any]) -> dict[str, Any]:
+    return {f"--{name.replace('_', '-')}": value for name, value in given.items()}
 
 
 def _verdicts(plan: "Plan", limit: int | None, kind: str) -> tuple[str, str]:

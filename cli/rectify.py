@@ -14,6 +14,17 @@ if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
 
 
+_MODELS = (
+    click.option("--left-model", type=options.FILE, help="RPC model of the left image; default that in or beside it."),
+    click.option("--right-model", type=options.FILE, help="RPC model of the right image."),
+)
+
+
+def model_options(command: options.Command) -> options.Command:
+    """Add options for the models of two raw images."""
+    return options.with_options(command, *_MODELS)
+
+
 def _raw(*, dem: Path | None, altitude: float | None, resolution_of: str | None) -> dict[str, Any]:
     return {"dem": dem, "altitude": altitude, "resolution_of": resolution_of}
 
@@ -41,8 +52,7 @@ def raw_options(command: options.Command) -> options.Command:
 @click.command(cls=options.Grouped, short_help="Make an epipolar pair of two raw images.")
 @image_options
 @click.argument("out", type=options.FILE)
-@click.option("--left-model", type=options.FILE, help="RPC model of the left image; default that in or beside it.")
-@click.option("--right-model", type=options.FILE, help="RPC model of the right image.")
+@model_options
 @raw_options
 @click.option("--geoid", type=options.FILE, help="Geoid grid that heights of --dem refer to; default the ellipsoid.")
 @cluster_options

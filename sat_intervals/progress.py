@@ -25,6 +25,19 @@ def add_seconds(seconds: dict[str, float], more: Mapping[str, float]) -> None:
         seconds[stage] = seconds.get(stage, 0.0) + took
 
 
+def clocked(seconds: dict[str, float], progress: Progress) -> Progress:
+    """Return a callback that adds the seconds since its last call to the stage of that call."""
+    last = "start", time.perf_counter()
+
+    def look(stage: str, done: int, total: int) -> None:
+        nonlocal last
+        before, last = last, (stage, time.perf_counter())
+        add_seconds(seconds, {before[0]: last[1] - before[1]})
+        progress(stage, done, total)
+
+    return look
+
+
 @contextmanager
 def logged_stage(seconds: dict[str, float], stage: str) -> Iterator[None]:
     """Time a stage as `timed` does, and log its start and end."""

@@ -79,6 +79,14 @@ class Epipolar:
     scales: tuple[float, float]
     figures: dict[str, Any]
 
+    def middle(self, side: int) -> "Epipolar":
+        """Return the grids of the part in the middle, as high and wide as a multiple of nodes below ``side``."""
+        height, width = (min(size, side // STEP * STEP) for size in (self.height, self.width))
+        row, column = (self.height - height) // 2 // STEP, (self.width - width) // 2 // STEP
+        rows, columns = -(-height // STEP) + 2 * MARGIN + 1, -(-width // STEP) + 2 * MARGIN + 1
+        left, right = (nodes[row : row + rows, column : column + columns] for nodes in (self.left, self.right))
+        return Epipolar(left, right, height, width, self.scales, self.figures)
+
 
 def grid_place() -> Georeferencing:
     """Return the georeferencing of the files of grids: epipolar positions of their cells' centres."""

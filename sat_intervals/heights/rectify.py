@@ -41,13 +41,17 @@ Compare = Callable[[Path, Path], dict[str, Any]]
 
 @dataclass(frozen=True)
 class RawPair:
-    """Two raw images, their models (None: those that belong to them), and what they are resampled to."""
+    """Two raw images, their models (None: those that belong to them), and what they are resampled to.
+
+    ``side`` is that of the part in the middle that is made, in pixels; by default all is.
+    """
 
     left: Image
     right: Image
     models: tuple[Path | None, Path | None]
     terrain: "Terrain"
     resolution_of: str = "coarser"
+    side: int | None = None
 
 
 def make_pair(
@@ -87,7 +91,8 @@ def _make(
 
     is_needed = pair.terrain.altitude is None and not pair.terrain.dem
     left, right, ground = read_with_ground(*readings, is_needed=is_needed)
-    geometry = epipolar_geometry(left, right, pair.terrain, pair.resolution_of, ground)
+    whole = epipolar_geometry(left, right, pair.terrain, pair.resolution_of, ground)
+    geometry = whole.middle(pair.side) if pair.side else whole
     files = [
         File(name, one.image.dtype, nodata_of(one.image), _GREY)
         for name, one in zip(IMAGES, (left, right), strict=True)
@@ -106,7 +111,8 @@ def _make(
         _note(out, asked | {"finished": None})
         images.publish()
         grids.publish()
-    record = asked | geometry.figures | {"bounds": "the upper bound of the disparity is the lower height", "rows": None}
+    more = {"bounds": "the upper bound of the disparity is the lower height", "rows": None}
+    record = asked | whole.figures | {"size": [whole.height, whole.width]} | more
     record["finished"] = datetime.now(UTC).isoformat(timespec="seconds")
     _note(out, record)
     return record

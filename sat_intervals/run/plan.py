@@ -64,9 +64,7 @@ def plan(
     config = resolved(load_config(config))
     left, right = checked_pair(left, right, config)
     region = checked_region(left, window)
-    if config.disparity.is_auto or config.disparity.is_local:
-        found = prepared_here(left, right, config, progress, measures_rows=False)
-        config = config.model_copy(update={"disparity": found.config.disparity})
+    config = found_range(left, right, config, progress)
 
     def sample(out: Path, one: Config, window: Window) -> dict[str, float]:
         progress("kernels", 0, 1)
@@ -74,6 +72,14 @@ def plan(
         return dict(match_pair(left, right, out, one, window=window, overwrite=True)["seconds"])
 
     return planned((left, right), region, config, sample, memory=memory, workers=workers)
+
+
+def found_range(left: Image, right: Image, config: Config, progress: Progress) -> Config:
+    """Return settings with the search range that they give, or that is found."""
+    if not (config.disparity.is_auto or config.disparity.is_local):
+        return config
+    found = prepared_here(left, right, config, progress, measures_rows=False)
+    return config.model_copy(update={"disparity": found.config.disparity})
 
 
 def planned(
@@ -84,8 +90,9 @@ def planned(
     *,
     memory: int | None = None,
     workers: int | None = None,
+    within: Window | None = None,
 ) -> Plan:
-    """Estimate what a run needs whose search range is known, see `plan`."""
+    """Estimate what a run needs whose search range is known, see `plan`; the sample is in the region, or ``within``."""
     config = fitted_to_jobs(config) if memory is None else fitted(config, memory, waiting=readers(config.cluster))
     workers = workers or tiles_at_once(config.cluster)
     strip = min(BLOCK, region.height), region.width
@@ -93,7 +100,7 @@ def planned(
         check_strips(*strip, config, memory)
     check_tiles(config, region)
     grid = Grid(region, config.tiles.size)
-    seconds, extra = _expected(sample, config, workers, grid)
+    seconds, extra = _expected(sample, config, workers, grid, within or region)
     together = workers if config.cluster.kind == "threads" else cores_of_process(config.cluster)
     waiting = readers(config.cluster) * waiting_bytes(config)
     task = max(tile_bytes(config), strip_bytes(*strip, config))
@@ -124,7 +131,7 @@ def _work(grid: Grid, config: Config) -> int:
     return sum(core.height + patch(core).height for core in rows) * sum(patch(core).width for core in columns) // 2
 
 
-def _expected(sample: Sample, config: Config, workers: int, grid: Grid) -> tuple[float, float]:
+def _expected(sample: Sample, config: Config, workers: int, grid: Grid, within: Window) -> tuple[float, float]:
     """Estimate the seconds of a run from a sample, and its extra work."""
     one = config.model_copy(update={"cluster": Cluster(workers=1)})  # also without the store of the run
     shape = SAMPLE, SAMPLE
@@ -133,7 +140,7 @@ def _expected(sample: Sample, config: Config, workers: int, grid: Grid) -> tuple
         one = one.model_copy(update={"tiles": config.tiles.model_copy(update={"size": size})})
         shape = size, 2 * size
     with tempfile.TemporaryDirectory() as folder:
-        window, seconds = _sampled(sample, Path(folder) / "sample", one, grid.region, shape)
+        window, seconds = _sampled(sample, Path(folder) / "sample", one, within, shape)
     pixels = grid.region.height * grid.region.width
     larger = pixels / (window.height * window.width)
     of_tiles = sum(seconds.get(f"tiles.{stage}", 0.0) for stage in ("read", "pixels", "costs", "match", "write"))
@@ -142,7 +149,8 @@ def _expected(sample: Sample, config: Config, workers: int, grid: Grid) -> tuple
     # In the sample one of two tiles hands states on, in four wavefronts; in the run all but the last do, in three.
     paths = 1.5 * larger * seconds.get("tiles.trace", 0.0) * (1 - 1 / len(grid))
     once = sum(seconds.get(stage, 0.0) for stage in ("start", "kernels", "inputs"))  # of whole images
-    strips = larger * seconds["bands"] / min(workers, -(-grid.region.height // BLOCK))
+    of_rows = sum(seconds.get(stage, 0.0) for stage in ("resampling", "bands", "cells"))
+    strips = larger * of_rows / min(workers, -(-grid.region.height // BLOCK))
     extra = paths / tiles if config.hands_states_on else work / pixels - 1
     return once + (tiles + paths) / min(workers, len(grid)) + strips + larger * seconds["files"], extra
 

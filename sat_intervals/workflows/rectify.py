@@ -64,7 +64,8 @@ def rectify(
     -------
     The content of ``rectify.json``: ``inputs``, ``settings``, ``altitude`` (metres, None with a DEM),
     ``base_to_height``, ``metres_per_disparity``, ``pixel_size`` (metres), ``overlap`` (share), ``footprint`` (degrees),
-    ``rows`` (None if they were not compared) and others; and ``warnings``, lines about the images.
+    ``size`` (rows, columns), ``rows`` (None if they were not compared) and others; and ``warnings``, lines about the
+    images.
 
     Raises
     ------
@@ -89,7 +90,7 @@ def rectified(
     overwrite: bool = False,
     **raw: Any,
 ) -> dict[str, Any]:
-    """Resample two raw images on workers; ``raw`` are ``dem``, ``altitude``, ``geoid``, ``resolution_of``."""
+    """Resample two raw images on workers; ``raw`` are arguments of `rectify`, and ``side``, see `RawPair`."""
     from sat_intervals.heights.epipolar import Terrain  # needs the extra `dsm`
 
     left, right = images
@@ -97,7 +98,7 @@ def rectified(
         None if file is None else path_of(file) for file in (raw["dem"], raw["geoid"], *(models or (None, None)))
     )
     terrain = Terrain(dem, raw["altitude"], geoid)
-    pair = RawPair(left, right, (left_model, right_model), terrain, raw["resolution_of"] or "coarser")
+    pair = RawPair(left, right, (left_model, right_model), terrain, raw["resolution_of"] or "coarser", raw.get("side"))
     compare = partial(compared_rows, each=pool) if compares_rows else None
     record = make_pair(pair, out, pool, overwrite=overwrite, compare=compare)
     return record | {"warnings": doubts_of_images(left, right)}

@@ -645,6 +645,25 @@ def test_surface__of_raw_images_has_the_heights_of_the_scene_and_later_commands_
     refused(["dsm", run, *SETTINGS], "left.tif was rectified again")
 
 
+def test_plan__of_a_raw_pair_resamples_its_middle_and_counts_tiles_of_all(made, raw, tmp_path, monkeypatch):
+    from sat_intervals.workflows import plan
+
+    height, width = json.loads((made / "rectify.json").read_text())["size"]
+    with rasterio.open(made / "left.tif") as dataset:
+        assert dataset.shape == (height, width)
+        whole = dataset.read(1)
+    parts = []
+    monkeypatch.setattr(plan, "_MIDDLE", 400)
+    monkeypatch.setattr(plan, "found_range", lambda left, *rest: parts.append(read_layers(left.path)[0]) or rest[1])
+    result = invoke("plan", *raw, *SETTINGS, "--disparity", -45, 15, "--tile-size", 128, "--json")
+    assert result.exit_code == 0, result.output
+    made = json.loads(result.stdout)
+    assert made["tiles"] == -(-height // 128) * -(-width // 128)
+    assert made["seconds"] > 0
+    row, column = (height - 390) // 2 // 30 * 30, (width - 390) // 2 // 30 * 30
+    assert_array_equal(parts[0], whole[row : row + 390, column : column + 390])
+
+
 def test_surface__in_a_folder_that_was_moved_serves_later_commands(made, tmp_path):
     before, out = tmp_path / "before", tmp_path / "out"
     shutil.copytree(made, before)

@@ -304,12 +304,14 @@ def test_plan__of_many_images_finds_grid_and_heights_and_takes_a_sample(sweep, t
     assert f"{low:.0f} to {high:.0f} m, every {swept['step']:.2f} m\n" in result.stdout
     assert re.search(r"tiles: +16 of 64 px, exact seams\n", result.stdout)
     assert re.search(r"memory of a worker: +\d+ MB, fits in 4000 MB\n", result.stdout)
-    assert re.search(r"expected time, 1 tile at once: +\d+ s", result.stdout)
+    assert re.search(r"expected time, 1 tile at once: +[\d.]+ (s|min)", result.stdout)
     assert all(re.search(rf"{one.name} +[-+]", result.stdout) for one in sweep.images)
 
 
 def test_plan__refuses_options_of_another_number_of_images(sweep):
     refused(("plan", *sweep.images[:3]), "give either --resolution or --grid-like")
-    refused(("plan", *sweep.images[:3], *WORDS, "--window", 0, 0, 9, 9), "--window is for two images: leave it out")
-    refused(("plan", *sweep.images[:2], *WORDS), "--resolution is for three images or more: leave it out")
+    refused(("plan", *sweep.images[:3], *WORDS, "--window", 0, 0, 9, 9), "--window is for epipolar images: leave")
+    refused(("plan", *sweep.images[:3], *WORDS, "--altitude", 1), "--altitude is for two images: leave it out")
+    refused(("plan", *sweep.images[:2], *WORDS, "--heights", 0, 9), "--heights is for three images or more: leave it")
+    refused(("plan", *sweep.images[:2], "--crs", CRS), "--crs is for surfaces, with --resolution or --grid-like: leave")
     refused(("plan", sweep.images[0]), "give two images or more")
