@@ -33,6 +33,7 @@ from sat_intervals.cli.stac import stac
 from sat_intervals.cli.status import status
 from sat_intervals.cli.surface import surface
 from sat_intervals.cli.triangulate import triangulate
+from sat_intervals.machine import keep_memory
 
 FAILED, USER_ERROR = 1, 2
 # Packages of extras.
@@ -63,6 +64,7 @@ class _Commands(click.Group):
         # imports and 0.5 s at the end.
         gc.set_threshold(5000)
         atexit.register(gc.freeze)
+        keep_memory()
         try:
             with armed():
                 return super().invoke(context)
