@@ -17,13 +17,14 @@ from sat_intervals.raster.files import File
 BLOCK = 512
 """Side of a block in pixels, and largest side of the smallest overview."""
 COLUMNS = 4 * BLOCK
-"""Columns compressed at a time: padded and interleaved copies stay small."""
+"""Columns compressed at a time: padded copies stay small."""
 AROUND = 8
 """Bytes around each block in a file: its size before it, and a copy of its last four bytes after it."""
 
 # Every GeoTIFF reader supports DEFLATE. On the bands of a Pleiades pair level 1 writes 5.4 Mpx per second and core, 49
 # bits per pixel; level 6: 3.2 and 46; no compression: 9.1 and 186. Predictors are slower and larger (4.3 and 63), since
 # bounds are integers and V-fits are fractions of small ones, whose bytes repeat.
+# Each band has blocks of its own: with the bands of a pixel side by side files are 16 % larger, in 1.4 times the time.
 # Of noisy bands ZSTD 3 writes 34 bits a pixel in 1.4 times the time of DEFLATE 1 (37).
 _LEVELS = {"deflate": {"zlevel": 1}, "zstd": {"zstd_level": 3}}
 _PREDICTORS = {"NO": 1, "FLOATING_POINT": 3}
@@ -57,7 +58,7 @@ def halved(bands: np.ndarray) -> np.ndarray:
 
 
 def compressed(bands: np.ndarray, file: File) -> CompressedRow:
-    """Compress ``(bands, at most BLOCK rows, columns)``, from left to right."""
+    """Compress ``(bands, at most BLOCK rows, columns)``: from left to right, a block of each band."""
     sizes: list[int] = []
     content = BytesIO()  # its value is not a copy
     for first in range(0, bands.shape[2], COLUMNS):
@@ -78,8 +79,9 @@ def _compressed(bands: np.ndarray, file: File) -> list[memoryview]:
             dataset.write(whole)
         with gdal.reading(memory.name) as dataset:
             places = [
-                [int(dataset.get_tag_item(f"BLOCK_{name}_{x}_0", "TIFF", bidx=1)) for name in ("OFFSET", "SIZE")]
+                [int(dataset.get_tag_item(f"BLOCK_{name}_{x}_0", "TIFF", bidx=band)) for name in ("OFFSET", "SIZE")]
                 for x in range(whole.shape[2] // BLOCK)
+                for band in dataset.indexes
             ]
         content = memoryview(memory.read())
     return [content[offset : offset + size] for offset, size in places]
@@ -91,7 +93,7 @@ def tiled(file: File) -> dict[str, Any]:
         "tiled": True,
         "blockxsize": BLOCK,
         "blockysize": BLOCK,
-        "interleave": "pixel",
+        "interleave": "band",
         "compress": file.compression,
         "predictor": _PREDICTORS[file.predictor],
     }

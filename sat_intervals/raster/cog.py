@@ -2,7 +2,7 @@
 
 GDAL compresses the blocks in memory and writes all tags into a small template file of the same kind. This module only
 computes the offsets of the blocks. The layout is that of GDAL's COG driver: directories, then the smallest overview
-first, each block between its size and a copy of its last four bytes.
+first, each block between its size and a copy of its last four bytes. Blocks of the bands of a place follow each other.
 """
 
 import struct
@@ -26,8 +26,10 @@ from sat_intervals.raster.vertical import with_vertical
 _SMALL = 128
 _CLASSIC = 1 << 32  # size from which a file is a BigTIFF
 # Tags of a TIFF directory, its types, and their sizes in bytes.
-_WIDTH, _HEIGHT, _BLOCK_WIDTH, _BLOCK_HEIGHT, _OFFSETS, _SIZES = 256, 257, 322, 323, 324, 325
+_WIDTH, _HEIGHT, _BLOCK_WIDTH, _BLOCK_HEIGHT, _OFFSETS, _SIZES, _PLANES = 256, 257, 322, 323, 324, 325, 284
 _KEYS, _TEXTS = 34735, 34737  # of a CRS
+# Order of blocks in a ghost area, before its last line, and the digits of the area's size.
+_TILES, _LAST, _DIGITS = b"INTERLEAVE=TILE\n", b"KNOWN", slice(30, 36)
 _ASCII, _SHORT, _LONG, _LONG8 = 2, 3, 4, 16
 _BYTES = {1: 1, _ASCII: 1, _SHORT: 2, _LONG: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, _LONG8: 8}
 
@@ -66,6 +68,9 @@ def template(file: File, place: Georeferencing, tags: Mapping[str, str]) -> Temp
             file.describe(dataset)
         copy(small.name, made.name, driver="COG", SPARSE_OK="YES", OVERVIEW_RESAMPLING="NEAREST", **options)
         ghost, directories = _parsed(bytes(made.getbuffer()))
+    if len(file.bands) > 1:  # GDAL's driver can do this since 3.11
+        size = b"%06d" % (int(ghost[_DIGITS]) + len(_TILES))
+        ghost = ghost.replace(ghost[_DIGITS], size, 1).replace(_LAST, _TILES + _LAST)
     whole = directories[0]
     level = tags.get("HEIGHTS", "")
     if file.is_of_heights and level.startswith("above") and place.crs and _KEYS in whole:
@@ -91,30 +96,31 @@ def assemble(
 def header(made: Template, shape: tuple[int, int], sizes: Sequence[Sequence[int]]) -> bytes:
     """Return all that comes before the first block: `template`, rows and columns, bytes of the blocks of each level."""
     ghost, (whole, overview) = made
-    directories = []
+    directories, levels = [], []
     for factor, of_level in zip(factors(*shape), sizes, strict=True):
         height, width = (-(-side // factor) for side in shape)
-        assert len(of_level) == -(-height // BLOCK) * -(-width // BLOCK)
+        levels.append(np.reshape(of_level, (-(-height // BLOCK) * -(-width // BLOCK), -1)))
         numbers = {_WIDTH: width, _HEIGHT: height}
         changed = {tag: (_LONG, 1, struct.pack("<I", number)) for tag, number in numbers.items()}
-        changed[_SIZES] = _LONG, len(of_level), np.array(of_level, "<u4").tobytes()
+        changed[_SIZES] = _LONG, len(of_level), levels[-1].T.astype("<u4").tobytes()
+        changed[_PLANES] = _SHORT, 1, struct.pack("<H", 1 if levels[-1].shape[1] == 1 else 2)  # 2: apart
         changed |= dict.fromkeys((_BLOCK_WIDTH, _BLOCK_HEIGHT), (_SHORT, 1, struct.pack("<H", BLOCK)))
         directories.append((whole if factor == 1 else overview) | changed)
     data = sum(size + AROUND for of_level in sizes for size in of_level)
-    is_big = data + len(_written(ghost, directories, sizes, 0, is_big=False)) >= _CLASSIC
-    start = len(_written(ghost, directories, sizes, 0, is_big=is_big))
-    return _written(ghost, directories, sizes, start, is_big=is_big)
+    is_big = data + len(_written(ghost, directories, levels, 0, is_big=False)) >= _CLASSIC
+    start = len(_written(ghost, directories, levels, 0, is_big=is_big))
+    return _written(ghost, directories, levels, start, is_big=is_big)
 
 
 def _written(
-    ghost: bytes, directories: Sequence[Directory], sizes: Sequence[Sequence[int]], start: int, *, is_big: bool
+    ghost: bytes, directories: Sequence[Directory], sizes: Sequence[np.ndarray], start: int, *, is_big: bool
 ) -> bytes:
-    """Return header, ghost area and directories of a file whose blocks begin at ``start``."""
+    """Return header, ghost area and directories of a file whose blocks begin at ``start``, of ``(places, bands)``."""
     kind, dtype = (_LONG8, "<u8") if is_big else (_LONG, "<u4")
     offsets: list[bytes] = []
     for of_level in reversed(sizes):
-        *places, start = accumulate(of_level, lambda place, size: place + size + AROUND, initial=start)
-        offsets.insert(0, (np.array(places, np.uint64) + 4).astype(dtype).tobytes())
+        *places, start = accumulate(of_level.flat, lambda place, size: place + int(size) + AROUND, initial=start)
+        offsets.insert(0, (np.reshape(places, of_level.shape).T + 4).astype(dtype).tobytes())
     out = bytearray(struct.pack("<2sHHHQ", b"II", 43, 8, 0, 0) if is_big else struct.pack("<2sHI", b"II", 42, 0))
     pointer, number, entry = (8, "<Q", "<HHQ8s") if is_big else (4, "<I", "<HHI4s")
     inline = struct.calcsize(number)

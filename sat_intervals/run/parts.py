@@ -25,7 +25,7 @@ PartKey = tuple[int, int]
 """Level of a file, 0 for its pixels, and row of blocks from the top."""
 
 # What finishes rows decides their bytes, too. The number increases when parts change.
-_CODE = *(zlib.crc32(Path(str(module.__file__)).read_bytes()) for module in (postprocess, refinement)), 3
+_CODE = *(zlib.crc32(Path(str(module.__file__)).read_bytes()) for module in (postprocess, refinement)), 4
 _HALF = "half of {}"
 _THREADS = 2  # that copy parts which workers cannot copy: one reads while another writes
 

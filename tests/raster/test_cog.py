@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import rasterio
 from helpers import PLACE
+from rasterio.enums import Interleaving
 from rasterio.errors import NotGeoreferencedWarning
 from rio_cogeo.cogeo import cog_validate
 
@@ -84,10 +85,15 @@ def test_assemble__is_a_valid_file_with_every_level(tmp_path, monkeypatch, file,
         with rasterio.open(path, **options) as dataset:
             np.testing.assert_array_equal(dataset.read(), bands)
             assert dataset.block_shapes[0] == (BLOCK, BLOCK)
+            assert dataset.interleaving == Interleaving.band
             np.testing.assert_equal(dataset.nodata, file.nodata)
     with rasterio.open(path) as dataset:
         assert (dataset.tags()["ALPHA"], dataset.tags(1)["meaning"]) == ("0.9", file.bands[0].meaning)
         assert Georeferencing.of(dataset) == PLACE
+    area = path.read_bytes()[16 if is_big else 8 :]
+    lines = area[43 : 43 + int(area[30:36])].decode()
+    assert lines.endswith("\nKNOWN_INCOMPATIBLE_EDITION=NO\n ")
+    assert ("INTERLEAVE=TILE\n" in lines) == (len(bands) > 1)
 
 
 def test_halved__is_the_mean_of_what_is_known_and_every_other_flag():
