@@ -4,6 +4,7 @@ Each command imports the library itself, so that help and usage errors do not wa
 """
 
 import atexit
+import ctypes
 import errno
 import gc
 from collections.abc import Sequence
@@ -33,9 +34,10 @@ from sat_intervals.cli.stac import stac
 from sat_intervals.cli.status import status
 from sat_intervals.cli.surface import surface
 from sat_intervals.cli.triangulate import triangulate
-from sat_intervals.machine import keep_memory
 
 FAILED, USER_ERROR = 1, 2
+# Settings of glibc: sizes of free memory and of an array from which on it gives memory back, and its number of pools.
+_TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
 # Packages of extras.
 _EXTRAS = {"matplotlib": "plot", "scipy": "dsm", "pyogrio": "reference", "shapely": "reference"}
 _ITEM = "\n  "
@@ -50,6 +52,13 @@ STEPS: dict[str, tuple[click.Command, ...]] = {
 }
 # The most common commands, which the command without arguments shows.
 _DAILY = (demo, surface, change, dsm, match, status, report, project, evaluate, export)
+
+
+def keep_memory() -> None:
+    """Let this process use memory of arrays again: to have it cleared by the system takes 10 % of a run's time."""
+    if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):
+        for setting, value in ((_TRIM_THRESHOLD, 1 << 29), (_MMAP_THRESHOLD, 1 << 29), (_ARENA_MAX, 1)):
+            mallopt(setting, value)
 
 
 class _Commands(click.Group):

@@ -1,16 +1,11 @@
-"""The memory and the cores that this process may use: in a container or a job, less than the machine has."""
+"""Find the memory and the cores that this process may use: in a container or a job, less than the machine has."""
 
-import ctypes
 import os
 import resource
 from collections.abc import Iterator
 from pathlib import Path
 
-KEPT_BYTES = 1 << 29
-"""Size of an array, and of memory that is free, from which on a process of ours gives memory back."""
 _ROOT = Path("/")
-# What glibc calls the sizes of free memory and of an array from which on it gives memory back, and its pools.
-_TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
 
 
 def usable_memory() -> int:
@@ -24,14 +19,6 @@ def usable_cores() -> int:
     """Return the least of CPU affinity and cgroup quotas; at least 1."""
     affinity = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min([affinity, *_core_limits(_ROOT)])
-
-
-def keep_memory() -> None:
-    """Let this process use memory of arrays again: to have it cleared by the system takes 10 % of a run's time."""
-    if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):  # of glibc
-        mallopt(_TRIM_THRESHOLD, KEPT_BYTES)
-        mallopt(_MMAP_THRESHOLD, KEPT_BYTES)
-        mallopt(_ARENA_MAX, 1)  # those of threads are small, and given back
 
 
 def _memory_limits(root: Path) -> Iterator[int]:

@@ -110,23 +110,3 @@ def test_usable_memory__is_at_most_the_address_space():
 
 def test_usable_cores__are_at_most_those_of_the_affinity():
     assert printed("usable_cores", partial(os.sched_setaffinity, 0, {min(os.sched_getaffinity(0))})) == 1
-
-
-def test_keep_memory__arrays_of_threads_take_the_pages_of_earlier_ones():
-    script = """
-from resource import RUSAGE_SELF, getrusage
-from threading import Thread
-import numpy as np
-from sat_intervals.machine import keep_memory
-keep_memory()
-for count in (1, 20):
-    before = getrusage(RUSAGE_SELF).ru_minflt
-    for _ in range(count):
-        thread = Thread(target=np.ones, args=(1 << 22,))
-        thread.start()
-        thread.join()
-    print(getrusage(RUSAGE_SELF).ru_minflt - before)
-"""
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    first, others = map(int, done.stdout.split())
-    assert others < first

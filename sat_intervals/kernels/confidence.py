@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sat_intervals.kernels.compiled import cached, inlined
+from sat_intervals.kernels.compiled import cached, inlined, part
 from sat_intervals.products import IMPOSSIBLE_COST
 
 
@@ -77,6 +77,15 @@ def low_confidence(confidence, threshold, kernel):
     return low
 
 
+@part
+def _widen(low, high, filled, lowest, highest, whole):
+    """Merge a line of windows into another one."""
+    for c in range(lowest.size):
+        lowest[c] = low[c] if low[c] < lowest[c] else lowest[c]
+        highest[c] = high[c] if high[c] > highest[c] else highest[c]
+        whole[c] &= filled[c]
+
+
 @cached
 def surroundings(values, kept, size):
     """Smallest and largest kept value in the window of each pixel, and whether all of its pixels in the image are kept.
@@ -86,23 +95,23 @@ def surroundings(values, kept, size):
     """
     rows, columns = values.shape
     radius, none = size // 2, np.float32(np.inf)
-    lowest, highest = np.empty((rows, columns), np.float32), np.empty((rows, columns), np.float32)
-    whole = np.empty((rows, columns), np.bool_)
-    least, most = np.full(columns + 2 * radius, none), np.full(columns + 2 * radius, -none)
-    filled = np.ones(columns + 2 * radius, np.bool_)
-    for r in range(rows):
-        inner = slice(radius, radius + columns)
-        least[inner], most[inner], filled[inner] = none, -none, True
-        for i in range(max(0, r - radius), min(rows, r + radius + 1)):
-            for c in range(columns):
-                low, high = (values[i, c], values[i, c]) if kept[i, c] else (none, -none)
-                least[c + radius] = low if low < least[c + radius] else least[c + radius]
-                most[c + radius] = high if high > most[c + radius] else most[c + radius]
-                filled[c + radius] &= kept[i, c]
-        lowest[r], highest[r], whole[r] = none, -none, True
-        for j in range(size):
-            for c in range(columns):
-                lowest[r, c] = least[c + j] if least[c + j] < lowest[r, c] else lowest[r, c]
-                highest[r, c] = most[c + j] if most[c + j] > highest[r, c] else highest[r, c]
-                whole[r, c] &= filled[c + j]
+    lowest, highest = np.full((rows, columns), none), np.full((rows, columns), -none)
+    whole = np.ones((rows, columns), np.bool_)
+    # The last rows, with a border of pixels that do not count, and the columns of the windows of one row.
+    wide = columns + 2 * radius
+    lows, highs, near = np.full((size, wide), none), np.full((size, wide), -none), np.ones((size, wide), np.bool_)
+    low, high, filled = np.empty(wide, np.float32), np.empty(wide, np.float32), np.empty(wide, np.bool_)
+    for r in range(-radius, rows):
+        entering, i = r + radius, (r + radius) % size
+        for c in range(columns):
+            is_kept = entering < rows and kept[entering, c]
+            lows[i, c + radius] = values[entering, c] if is_kept else none
+            highs[i, c + radius] = values[entering, c] if is_kept else -none
+            near[i, c + radius] = is_kept or entering >= rows
+        if r >= 0:
+            low[:], high[:], filled[:] = none, -none, True
+            for i in range(size):
+                _widen(lows[i], highs[i], near[i], low, high, filled)
+            for j in range(size):
+                _widen(low[j:], high[j:], filled[j:], lowest[r], highest[r], whole[r])
     return lowest, highest, whole

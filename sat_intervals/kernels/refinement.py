@@ -22,6 +22,9 @@ _NONE, _LEAST = np.float32(1.0), np.float32(0.1)
 _SURFACE, _FLAT_SURFACE = np.float32(1.0), np.float32(0.75)
 # Fewest pixels of a fit, smallest gain that counts as likeness, largest move in pixels.
 _FEWEST, _LIKENESS, _MOVE = 6, 0.1, 1.0
+# Deviation in pixels that stands for a pixel without a fit; what is added to a deviation, to a side of the cut, and to
+# relief; range of disparities around from which on there is an edge, in pixels.
+_NO_FIT, _HALF, _EDGE = np.float32(1.0), np.float32(0.5), np.float32(2.0)
 # Least share of the variance of slopes that is not that of values; what is added to the squares of a plane's slopes.
 _TEXTURE, _FLAT = 1e-5, 1e-3
 _PIECE = 256
@@ -223,3 +226,30 @@ def on_planes(disparity, deviation):
                 if not np.isnan(deviation[r, first + c]):
                     result[r, first + c] += _at_middle(sums, c)
     return result
+
+
+@cached
+def sides_of_bounds(fits, cuts, around):
+    """Distances from a disparity to its bounds of a factor of 1, in pixels, and whether it is at an edge.
+
+    Each is ``(.5 + deviation) (.5 + cut) sqrt(.5 + relief)``, by the side's cut and relief.
+
+    fits: disparity and deviation, NaN for none; cuts: lower and upper bounds; around: see `surroundings`. All
+    ``(rows, columns)``, float32 pixels, but the last, bool.
+    Returns two such arrays of float32, and one of bool.
+    """
+    (disparity, deviation), (lower, upper), (lowest, highest, whole) = fits, cuts, around
+    below, above = np.empty(disparity.shape, np.float32), np.empty(disparity.shape, np.float32)
+    edge, zero = np.empty(disparity.shape, np.bool_), np.float32(0)
+    for r in range(disparity.shape[0]):
+        for c in range(disparity.shape[1]):
+            d, s = disparity[r, c], deviation[r, c]
+            scale = _HALF + (_NO_FIT if np.isnan(s) else s)
+            cut, relief = d - lower[r, c], d - lowest[r, c]
+            cut, relief = zero if cut < zero else cut, zero if relief < zero else relief
+            below[r, c] = scale * (_HALF + cut) * np.sqrt(_HALF + relief)
+            cut, relief = upper[r, c] - d, highest[r, c] - d
+            cut, relief = zero if cut < zero else cut, zero if relief < zero else relief
+            above[r, c] = scale * (_HALF + cut) * np.sqrt(_HALF + relief)
+            edge[r, c] = not whole[r, c] or highest[r, c] - lowest[r, c] > _EDGE
+    return below, above, edge

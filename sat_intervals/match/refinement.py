@@ -6,14 +6,18 @@ import numpy as np
 
 from sat_intervals.config import Config
 from sat_intervals.kernels.confidence import surroundings
-from sat_intervals.kernels.refinement import FIT, MARGIN, PLANE, facing_values, least_squares, on_planes
+from sat_intervals.kernels.refinement import (
+    FIT,
+    MARGIN,
+    PLANE,
+    facing_values,
+    least_squares,
+    on_planes,
+    sides_of_bounds,
+)
 from sat_intervals.tiling import Views, Window
 
-# Deviation in pixels that stands for a pixel without a fit; what is added to a deviation, to a side of the cut, and to
-# relief.
-_NO_FIT, _HALF = np.float32(1.0), np.float32(0.5)
-# Side of the windows of relief, and the range of disparities in them from which on they hold an edge, in pixels.
-_AROUND, _EDGE = 9, 2
+_AROUND = 9  # side of the windows of relief, in pixels
 
 
 class Refined(NamedTuple):
@@ -72,14 +76,8 @@ def smoothed(disparity: np.ndarray, kept: np.ndarray, config: Config) -> np.ndar
 
 def half_widths(fits: Refined, lower: np.ndarray, upper: np.ndarray, kept: np.ndarray) -> HalfWidths:
     """Return what a cut, the precision of the fit, and the relief around give together; see `bounds_of_both`."""
-    disparity, deviation = fits
-    lowest, highest, whole = surroundings(disparity, kept, _AROUND)
-    scale = _HALF + np.where(np.isnan(deviation), _NO_FIT, deviation)
-    sides = ((disparity - lower, disparity - lowest), (upper - disparity, highest - disparity))
-    below, above = (
-        scale * (_HALF + np.maximum(cut, 0)) * np.sqrt(_HALF + np.maximum(relief, 0)) for cut, relief in sides
-    )
-    return HalfWidths(below, above, ~whole | (highest - lowest > _EDGE))
+    around = surroundings(fits.disparity, kept, _AROUND)
+    return HalfWidths(*sides_of_bounds(tuple(fits), (lower, upper), around))
 
 
 def bounds_of_both(

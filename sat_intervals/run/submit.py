@@ -20,7 +20,7 @@ from distributed.utils import silence_logging_cmgr
 
 from sat_intervals.config import Cluster
 from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.machine import KEPT_BYTES, usable_cores
+from sat_intervals.machine import usable_cores
 from sat_intervals.run.batch_system import batch_system
 from sat_intervals.run.workers import CHECK_EVERY, Outcome, Task, in_flight, readers, reason
 
@@ -32,9 +32,9 @@ DASK = {
     "distributed.admin.tick.interval": "1s",
     "distributed.worker.profile.enabled": False,
     # Its nannies let workers give memory back after each array: the system then takes a fourth of the time.
-    # See `machine.keep_memory`.
-    "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": KEPT_BYTES,
-    "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": KEPT_BYTES,
+    # The commands do the same, see `cli.app`; pools of threads would be small, and given back.
+    "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 1 << 29,
+    "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 1 << 29,
     "distributed.nanny.pre-spawn-environ.MALLOC_ARENA_MAX": 1,
 }
 WORKERS_GONE = 300.0  # seconds after the last worker left, at which a run ends
