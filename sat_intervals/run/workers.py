@@ -58,10 +58,10 @@ def results(
     for outcome in workers.outcomes(tasks):
         if outcome is not None:
             if (error := outcome.error) is not None:
-                check_not_full(error)
                 if isinstance(error, SatIntervalsError):  # names files and the way out
                     raise error
-                raise RunError(f"{failed(outcome.label)}: {reason(error)}; rerun the same command") from error
+                check_not_full(error, what := failed(outcome.label))
+                raise RunError(f"{what}: {reason(error)}; rerun the same command") from error
             done += 1
             yield outcome.label, outcome.result
         look(done)
@@ -166,7 +166,7 @@ def tiles_at_once(settings: Cluster) -> int:
     return (settings.maximum_jobs or settings.jobs) * settings.cores
 
 
-def check_not_full(error: BaseException, place: object = "disk") -> None:
+def check_not_full(error: BaseException, place: object) -> None:
     """Raise if a task failed because the disk is full: all others would fail too."""
     if isinstance(error, OSError) and error.errno in _FULL_DISK:
         raise RunError(
