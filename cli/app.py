@@ -36,8 +36,8 @@ from sat_intervals.cli.surface import surface
 from sat_intervals.cli.triangulate import triangulate
 
 FAILED, USER_ERROR = 1, 2
-# Settings of glibc: sizes of free memory and of an array from which on it gives memory back, and its number of pools.
-_TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
+# Settings of glibc: sizes of free memory and of an array from which on it gives memory back.
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 # Packages of extras.
 _EXTRAS = {"matplotlib": "plot", "scipy": "dsm", "pyogrio": "reference", "shapely": "reference"}
 _ITEM = "\n  "
@@ -55,10 +55,10 @@ _DAILY = (demo, surface, change, dsm, match, status, report, project, evaluate, 
 
 
 def keep_memory() -> None:
-    """Let this process use memory of arrays again: to have it cleared by the system takes 10 % of a run's time."""
+    """Let this process use memory of arrays again: to have it cleared by the system takes 5 % of a run's time."""
     if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):
-        for setting, value in ((_TRIM_THRESHOLD, 1 << 29), (_MMAP_THRESHOLD, 1 << 29), (_ARENA_MAX, 1)):
-            mallopt(setting, value)
+        for setting in (_TRIM_THRESHOLD, _MMAP_THRESHOLD):
+            mallopt(setting, 1 << 29)
 
 
 class _Commands(click.Group):
