@@ -14,7 +14,7 @@ PARALLEL := -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 # Python keeps the bytecode of what it imports: each process would otherwise compile it again, in seconds.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-marked test-all lint bench bench-seams surface-bounds change-bench many-bench voids-bench ablation tune calibration coverage pictures notebook docs dist clean
+.PHONY: demo test test-marked test-all lint bench bench-seams surface-bounds change-bench many-bench voids-bench ablation tune calibration coverage comparison pictures notebook docs dist clean
 
 demo: $(VENV)/.has-plot
 	$(BIN)/sat-intervals demo demo-out --overwrite --size 800 800
@@ -77,6 +77,10 @@ voids-bench: $(VENV)/.has-dsm
 # The tables of docs/coverage.md, on the same pairs; about five minutes after `make calibration`, else half an hour more.
 coverage: $(VENV)/.has-mccnn
 	$(BIN)/python -W ignore tests/benchmarks/coverage_tables.py
+
+# The tables of docs/comparison.md, with the commands cars and s2p that are on PATH; an hour, nearly all of it CARS.
+comparison: $(VENV)/.has-dsm,test
+	$(BIN)/python -W ignore docs/comparison.py $(MANY) build/comparison
 
 # The pictures of README.md and docs; 256 colours keep them small. RAW is the folder of a raw pair, MANY of raw images.
 RAW ?= $(SAT_INTERVALS_SHARED)/data/raw_picanteo_pre

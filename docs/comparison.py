@@ -1,12 +1,14 @@
-"""The table of comparison.md: one raw pair through CARS with its own matcher, and through this project.
+"""The tables of comparison.md (`make comparison`): raw images through CARS, s2p and this project, against LiDAR.
 
-Usage: python docs/comparison.py PAIR OUT. The terrain is that of raw_picanteo_pre; for another PAIR change HEIGHT, CRS
-and the place in write_terrain. PAIR has left.tif, right.tif and their RPC models left.geom, right.geom. It
-needs the extras `cars`, `dsm` and `test`.
+Usage: python docs/comparison.py IMAGES OUT. IMAGES has raw images 001.tif and others, with RPC tags, and
+lidar_west.tif. Commands `cars` and `s2p` are looked for beside python, then on PATH; what is not there has no row. It
+needs the extras `dsm` and `test`.
 """
 
 import json
 import os
+import resource
+import shutil
 import subprocess
 import sys
 import threading
@@ -17,19 +19,40 @@ from typing import Any
 import numpy as np
 import psutil
 import rasterio
-from rasterio.enums import Resampling
-from rasterio.transform import from_origin
-from rasterio.vrt import WarpedVRT
 
-RESOLUTION, CRS = 1.0, 32637
-HEIGHT = 706.0  # metres above the ellipsoid, of the terrain that both are given
+from sat_intervals.evaluate.comparison import compared, open_comparison, registered
+from sat_intervals.products import SURFACE
+from sat_intervals.raster.layers import read_known
+from sat_intervals.tiling import Window
+
+RESOLUTION, CRS, BAND, CORES = 0.5, 32617, 2, os.cpu_count()
+PAIR, THREE = ("003", "004"), ("003", "004", "005")
+HEADS = (
+    "images, tool | time | processor time | memory | cells with a height | median error | mean error | coverage | "
+    "median half width"
+)
+# Figures of papers, which this script does not measure; see comparison.md.
+PUBLISHED = """\
+| [EOGS++](https://arxiv.org/abs/2511.16542), 19 images | 0.93 m | | 25 min | GPU, 24 GB | none |
+| [EOGS](https://arxiv.org/abs/2412.13047), 19 images | 1.09 m | 1.46 m | 3 min | GPU | none |
+| EO-NeRF, by EOGS | | 1.35 m | 15 h | GPU | none |
+| SAT-NGP, by EOGS | | 1.72 m | 25 min | GPU | none |
+| s2p, by EOGS | | 1.53 m | 20 min | | none |"""
 
 
-def measured(name: str, *command: object, **options: Any) -> dict[str, Any]:
-    """Run a command; return its seconds, those of processors, and the peak of its memory (proportional) in MB."""
-    began, peak, processor = time.perf_counter(), 0, {}
-    process = psutil.Popen([str(word) for word in command], **options)
-    ended = threading.Event()
+def command(name: str) -> str | None:
+    """Return a command beside python, or on PATH."""
+    return shutil.which(name, path=str(Path(sys.executable).parent)) or shutil.which(name)
+
+
+def measured(*words: object, folder: Path) -> dict[str, float]:
+    """Run a command in a folder; return its seconds, those of processors, and the peak of its memory in MB."""
+    began, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
+    peak, seen, ended = 0, {}, threading.Event()
+    path = f"{Path(str(words[0])).parent}{os.pathsep}{os.environ['PATH']}"
+    with (folder / f"{Path(str(words[0])).name}.log").open("w") as log:
+        given = {"cwd": folder, "stdout": log, "stderr": subprocess.STDOUT, "env": {**os.environ, "PATH": path}}
+        process = psutil.Popen([str(word) for word in words], **given)
 
     def watch() -> None:
         nonlocal peak
@@ -38,7 +61,7 @@ def measured(name: str, *command: object, **options: Any) -> dict[str, Any]:
             for one in (process, *process.children(recursive=True)):
                 try:
                     used += one.memory_full_info().pss
-                    processor[one.pid] = sum(one.cpu_times()[:2])
+                    seen[one.pid] = sum(one.cpu_times()[:2])
                 except psutil.Error:
                     continue
             peak = max(peak, used)
@@ -49,82 +72,130 @@ def measured(name: str, *command: object, **options: Any) -> dict[str, Any]:
     ended.set()
     watcher.join()
     if status:
-        raise SystemExit(f"{name} ended with status {status}")
-    return {"s": time.perf_counter() - began, "processor s": sum(processor.values()), "MB": peak / 1e6}
+        raise SystemExit(f"{words[0]} ended with status {status}: see {log.name}")
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    waited = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    # Each sum lacks some: processes that live shortly, and those that nobody waits for.
+    return {"s": time.perf_counter() - began, "processor s": max(waited, sum(seen.values())), "MB": peak / 1e6}
 
 
-def write_terrain(path: Path) -> Path:
-    """Write a flat terrain around the scene."""
-    place = from_origin(36.88, 37.61, 0.005, 0.005)
-    kind = {"height": 12, "width": 12, "count": 1, "dtype": "float32", "crs": "EPSG:4326", "transform": place}
-    with rasterio.open(path, "w", driver="GTiff", **kind) as file:
-        file.write(np.full((1, 12, 12), HEIGHT, np.float32))
-    return path
+def write_bands(images: list[Path], folder: Path) -> list[str]:
+    """Write the band that is compared, with its RPC model, to files of one band."""
+    for path in images:
+        with rasterio.open(path) as file:
+            kind = {"driver": "GTiff", "width": file.width, "height": file.height, "count": 1, "dtype": "uint8"}
+            with rasterio.open(folder / path.name, "w", **kind, rpcs=file.rpcs) as out:
+                out.write(file.read(BAND), 1)
+    return [path.name for path in images]
 
 
-def run_cars(pair: Path, folder: Path, command: Path) -> tuple[dict[str, Any], Path]:
-    """Make a surface with CARS and its own matcher."""
-    sensors = {
-        side: {
-            "image": str(pair / f"{side}.tif"),
-            "geomodel": {"path": str(pair / f"{side}.geom"), "model_type": "RPC"},
-        }
-        for side in ("left", "right")
-    }
-    terrain = {"dem": str(write_terrain(folder / "terrain.tif"))}
+def write_surface(heights: Path, half_widths: Path | None, out: Path) -> Path:
+    """Write heights of another tool, and half widths if it has them, with the bands of our surfaces."""
+    height = read_known(heights)[0]
+    half = read_known(half_widths)[-1] if half_widths else np.full_like(height, np.nan)
+    values = {"height": height, "height_lower": height - half, "height_upper": height + half}
+    with rasterio.open(heights) as like:
+        kind = {**like.profile, "driver": "GTiff", "count": len(SURFACE), "dtype": "float32", "nodata": np.nan}
+    with rasterio.open(out, "w", **kind) as file:
+        for number, band in enumerate(SURFACE, 1):
+            file.write(values.get(band.name, np.full_like(height, np.nan)).astype(np.float32), number)
+            file.set_band_description(number, band.name)
+    return out
+
+
+def run_cars(images: list[Path], folder: Path, *_: object) -> tuple[dict[str, float], Path]:
+    """Make a surface with CARS and its own matcher, all pairs fused, with its map of errors from intervals."""
+    names = write_bands(images, folder)
+    pairs = [[one, other] for number, one in enumerate(names) for other in names[number + 1 :]]
+    maps = {"dense_matching": {"performance_map_method": ["risk", "intervals"]}}
     configuration = {
-        "input": {"sensors": sensors, "pairing": [["left", "right"]], "initial_elevation": terrain},
-        "output": {"directory": "cars", "resolution": RESOLUTION, "epsg": CRS, "geoid": False},
-        "orchestrator": {"mode": "multiprocessing", "nb_workers": os.cpu_count()},
+        "input": {"sensors": {name: {"image": name} for name in names}, "pairing": pairs},
+        "output": {
+            "directory": "cars",
+            "resolution": RESOLUTION,
+            "epsg": CRS,
+            "geoid": False,
+            "auxiliary": {"performance_map": [0]},
+        },
+        "orchestrator": {"mode": "multiprocessing", "nb_workers": CORES},
         "subsampling": {"advanced": {"resolutions": [1]}},
+        "surface_modeling": {"applications": {"all": maps}},
     }
     (folder / "cars.json").write_text(json.dumps(configuration, indent=1))
-    with (folder / "cars.log").open("w") as log:
-        figures = measured("cars", command, "cars.json", cwd=folder, stdout=log, stderr=subprocess.STDOUT)
-    return figures, folder / "cars" / "dsm" / "dsm.tif"
+    figures = measured(command("cars"), "cars.json", folder=folder)
+    made = folder / "cars" / "dsm"
+    return figures, write_surface(made / "dsm.tif", made / "performance_map.tif", folder / "surface.tif")
 
 
-def run_ours(pair: Path, folder: Path, command: Path) -> tuple[dict[str, Any], Path]:
+def run_s2p(images: list[Path], folder: Path, *_: object) -> tuple[dict[str, float], Path]:
+    """Make a surface with s2p: the first image with each other one."""
+    names = write_bands(images, folder)
+    configuration = {
+        "images": [{"img": name} for name in names],
+        "full_img": True,
+        "dsm_resolution": RESOLUTION,
+        "out_dir": "s2p",
+        "temporary_dir": "temporary",
+        "tile_size": 400,
+        "max_processes": CORES,
+    }
+    (folder / "s2p.json").write_text(json.dumps(configuration, indent=1))
+    figures = measured(command("s2p"), "s2p.json", folder=folder)
+    return figures, write_surface(folder / "s2p" / "dsm.tif", None, folder / "surface.tif")
+
+
+def run_ours(images: list[Path], folder: Path, *options: object) -> tuple[dict[str, float], Path]:
     """Make a surface with this project."""
-    models = [word for side in ("left", "right") for word in (f"--{side}-model", pair / f"{side}.geom")]
-    images = pair / "left.tif", pair / "right.tif"
-    options = "--resolution", RESOLUTION, "--crs", f"EPSG:{CRS}", "--altitude", HEIGHT, "--overwrite", "--quiet"
-    out = folder / "sat_intervals"
-    return measured("surface", command, "surface", *images, out, *models, *options), out / "dsm.tif"
+    usual = "--band", BAND, "--resolution", RESOLUTION, "--overwrite", "--quiet"
+    figures = measured(command("sat-intervals"), "surface", *images, "made", *usual, *options, folder=folder)
+    return figures, folder / "made" / "dsm.tif"
 
 
-def on_grid(path: Path, like: Any, band: int = 1) -> np.ndarray:
-    """Read a band on the cells of another raster, NaN where it has no value."""
-    grid = {"crs": like.crs, "transform": like.transform, "height": like.height, "width": like.width}
-    with rasterio.open(path) as file, WarpedVRT(file, resampling=Resampling.nearest, nodata=np.nan, **grid) as warped:
-        return np.asarray(warped.read(band), np.float64)
+def judged(surface: Path, lidar: Path) -> dict[str, float]:
+    """Return what a surface, moved onto LiDAR by a shift, is worth."""
+    comparison, _ = registered(open_comparison(surface, lidar))
+    (height, lower, upper, truth, *_), *_ = compared(comparison, Window(0, 0, *comparison.shape))
+    has_bounds = np.isfinite(lower) & np.isfinite(upper)
+    away, half = np.abs(height - truth), (upper - lower)[has_bounds] / 2
+    inside = ((lower <= truth) & (truth <= upper))[has_bounds]
+    figures = {"cells": away.size / np.isfinite(read_known(lidar)[0]).sum(), "median": np.median(away)}
+    figures |= {"mean": away.mean(), "coverage": inside.mean() if inside.size else np.nan}
+    return figures | {"half width": np.median(half) if half.size else np.nan}
 
 
-def main(pair: Path, folder: Path) -> None:
-    """Run both and print a table."""
-    folder.mkdir(parents=True, exist_ok=True)
-    scripts = Path(sys.executable).parent
-    rows = {}
-    for name, run, command in (("CARS", run_cars, "cars"), ("this project", run_ours, "sat-intervals")):
-        if run is run_ours:
-            run(pair, folder, scripts / command)  # compiles once for all runs; workers of CARS compile in each
-        rows[name] = run(pair, folder, scripts / command)
-    with rasterio.open(rows["this project"][1]) as like:
-        heights = {name: on_grid(path, like) for name, (_, path) in rows.items()}
-        lower, upper = (on_grid(rows["this project"][1], like, band) for band in (2, 3))
-    print("| | time | processor time | memory | cells with a height |\n|---|---|---|---|---|")
-    for name, (figures, _) in rows.items():
-        words = [f"{figures['s']:.0f} s", f"{figures['processor s']:.0f} s", f"{figures['MB']:.0f} MB"]
-        print(f"| {name} | {' | '.join(words)} | {100 * np.isfinite(heights[name]).mean():.1f} % |")
-    theirs, ours = heights["CARS"], heights["this project"]
-    error = (ours - theirs)[np.isfinite(ours) & np.isfinite(theirs)]
-    inside = ((lower <= theirs) & (theirs <= upper))[np.isfinite(ours) & np.isfinite(theirs)].mean()
-    spread = 1.4826 * np.median(np.abs(error - np.median(error)))
-    print(f"heights of both: median difference {np.median(error):+.3f} m, NMAD {spread:.2f} m")
-    print(
-        f"{100 * (np.abs(error) <= 1).mean():.1f} % within 1 m, {100 * inside:.1f} % of those of CARS in our intervals"
-    )
-    print(f"median half width of our intervals: {np.nanmedian(upper - lower) / 2:.2f} m")
+def row(name: str, made: dict[str, float], found: dict[str, float]) -> str:
+    """Return a row of the first table."""
+    bounds = [f"{found['coverage']:.2f}", f"{found['half width']:.2f} m"] if found["coverage"] >= 0 else ["none", ""]
+    words = [name, f"{made['s']:.0f} s", f"{made['processor s']:.0f} s", f"{made['MB']:.0f} MB"]
+    words += [f"{100 * found['cells']:.0f} %", f"{found['median']:.2f} m", f"{found['mean']:.2f} m", *bounds]
+    return f"| {' | '.join(words)} |"
+
+
+def main(images: Path, out: Path) -> None:
+    """Run all and print the tables."""
+    lidar = images / "lidar_west.tif"
+    tools = {"CARS 1.3": run_cars, "s2p": run_s2p, "`surface`": run_ours}
+    tools = {name: run for name, run in tools.items() if command(run.__name__.removeprefix("run_")) or run is run_ours}
+    print(f"| {HEADS} |\n|{'---|' * len(HEADS.split(' | '))}")
+
+    def made(numbers: tuple[str, ...], run: Any, *options: object) -> tuple[dict[str, float], dict[str, float]]:
+        folder = out / f"{run.__name__}_{len(numbers)}"
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        figures, surface = run([images / f"{one}.tif" for one in numbers], folder, *options)
+        return figures, judged(surface, lidar)
+
+    for label, numbers in ("two", PAIR), ("three", THREE):
+        made(numbers, run_ours)  # compiles once for all runs; workers of CARS compile in each
+        for name, run in tools.items():
+            print(row(f"{label}, {name}", *made(numbers, run)), flush=True)
+    figures, found = made(tuple(sorted(path.stem for path in images.glob("0*.tif"))), run_ours, "--fill")
+    print("\n| method | mean error here | mean of four places | time | needs | error bars |\n|---|---|---|---|---|---|")
+    print(PUBLISHED)
+    needs = f"{CORES} cores, {figures['MB']:.0f} MB"
+    bars = f"coverage {found['coverage']:.2f}, median half width {found['half width']:.2f} m"
+    print(f"| `surface --fill`, ten images | {found['mean']:.2f} m | | {figures['s']:.0f} s | {needs} | {bars} |")
+    print(f"\nfilled: {100 * found['cells']:.1f} % of the cells, median error {found['median']:.2f} m")
 
 
 if __name__ == "__main__":
