@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import psutil
 import rasterio
+from rasterio.transform import rowcol, xy
 
 from sat_intervals.evaluate.comparison import compared, open_comparison, registered
 from sat_intervals.products import SURFACE
@@ -31,6 +32,7 @@ HEADS = (
     "images, tool | time | processor time | memory | cells with a height | median error | mean error | coverage | "
     "median half width"
 )
+HEADS_PUBLISHED = "method | mean error here | mean of four places | time | needs | error bars"
 # Figures of papers, which this script does not measure; see comparison.md.
 PUBLISHED = """\
 | [EOGS++](https://arxiv.org/abs/2511.16542), 19 images | 0.93 m | | 25 min | GPU, 24 GB | none |
@@ -151,51 +153,55 @@ def run_ours(images: list[Path], folder: Path, *options: object) -> tuple[dict[s
     return figures, folder / "made" / "dsm.tif"
 
 
-def judged(surface: Path, lidar: Path) -> dict[str, float]:
-    """Return what a surface, moved onto LiDAR by a shift, is worth."""
+def judged(surface: Path, lidar: Path) -> tuple[dict[str, float], np.ndarray]:
+    """Return what a surface, moved onto LiDAR by a shift, is worth, and its errors in the cells of LiDAR."""
     comparison, _ = registered(open_comparison(surface, lidar))
-    (height, lower, upper, truth, *_), *_ = compared(comparison, Window(0, 0, *comparison.shape))
+    (height, lower, upper, truth, *_), known, _ = compared(comparison, Window(0, 0, *comparison.shape))
+    errors = np.full(read_known(lidar)[0].shape, np.nan)
+    x, y = (np.asarray(values) for values in xy(comparison.place.transform, *known))
+    with rasterio.open(lidar) as file:
+        place = np.asarray(rowcol(file.transform, x - comparison.shift[0], y - comparison.shift[1])).astype(int)
+    is_inside = ((place >= 0) & (place < np.array(errors.shape)[:, np.newaxis])).all(axis=0)
+    errors[tuple(place[:, is_inside])] = np.abs(height - truth)[is_inside]
     has_bounds = np.isfinite(lower) & np.isfinite(upper)
-    away, half = np.abs(height - truth), (upper - lower)[has_bounds] / 2
-    inside = ((lower <= truth) & (truth <= upper))[has_bounds]
-    figures = {"cells": away.size / np.isfinite(read_known(lidar)[0]).sum(), "median": np.median(away)}
-    figures |= {"mean": away.mean(), "coverage": inside.mean() if inside.size else np.nan}
-    return figures | {"half width": np.median(half) if half.size else np.nan}
+    half, inside = (upper - lower)[has_bounds] / 2, ((lower <= truth) & (truth <= upper))[has_bounds]
+    bounds = {"coverage": inside.mean(), "half width": np.median(half)} if half.size else {}
+    return {"cells": np.isfinite(errors).sum() / np.isfinite(read_known(lidar)[0]).sum(), **bounds}, errors
 
 
-def row(name: str, made: dict[str, float], found: dict[str, float]) -> str:
+def row(name: str, made: dict[str, float], found: dict[str, float], errors: np.ndarray, common: np.ndarray) -> str:
     """Return a row of the first table."""
-    bounds = [f"{found['coverage']:.2f}", f"{found['half width']:.2f} m"] if found["coverage"] >= 0 else ["none", ""]
     words = [name, f"{made['s']:.0f} s", f"{made['processor s']:.0f} s", f"{made['MB']:.0f} MB"]
-    words += [f"{100 * found['cells']:.0f} %", f"{found['median']:.2f} m", f"{found['mean']:.2f} m", *bounds]
+    words += [f"{100 * found['cells']:.0f} %"]
+    words += [f"{of(errors):.2f} m ({of(errors[common]):.2f} m)" for of in (np.nanmedian, np.nanmean)]
+    words += [f"{found['coverage']:.3f}", f"{found['half width']:.2f} m"] if "coverage" in found else ["none", ""]
     return f"| {' | '.join(words)} |"
 
 
 def main(images: Path, out: Path) -> None:
     """Run all and print the tables."""
-    lidar = images / "lidar_west.tif"
     tools = {"CARS 1.3": run_cars, "s2p": run_s2p, "`surface`": run_ours}
-    tools = {name: run for name, run in tools.items() if command(run.__name__.removeprefix("run_")) or run is run_ours}
-    print(f"| {HEADS} |\n|{'---|' * len(HEADS.split(' | '))}")
+    tools = {name: run for name, run in tools.items() if run is run_ours or command(run.__name__.removeprefix("run_"))}
 
-    def made(numbers: tuple[str, ...], run: Any, *options: object) -> tuple[dict[str, float], dict[str, float]]:
+    def made(numbers: tuple[str, ...], run: Any, *options: object) -> tuple[Any, ...]:
         folder = out / f"{run.__name__}_{len(numbers)}"
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         figures, surface = run([images / f"{one}.tif" for one in numbers], folder, *options)
-        return figures, judged(surface, lidar)
+        return figures, *judged(surface, images / "lidar_west.tif")
 
+    print(f"| {HEADS} |\n|{'---|' * len(HEADS.split(' | '))}")
     for label, numbers in ("two", PAIR), ("three", THREE):
         made(numbers, run_ours)  # compiles once for all runs; workers of CARS compile in each
-        for name, run in tools.items():
-            print(row(f"{label}, {name}", *made(numbers, run)), flush=True)
-    figures, found = made(tuple(sorted(path.stem for path in images.glob("0*.tif"))), run_ours, "--fill")
-    print("\n| method | mean error here | mean of four places | time | needs | error bars |\n|---|---|---|---|---|---|")
-    print(PUBLISHED)
-    needs = f"{CORES} cores, {figures['MB']:.0f} MB"
-    bars = f"coverage {found['coverage']:.2f}, median half width {found['half width']:.2f} m"
-    print(f"| `surface --fill`, ten images | {found['mean']:.2f} m | | {figures['s']:.0f} s | {needs} | {bars} |")
-    print(f"\nfilled: {100 * found['cells']:.1f} % of the cells, median error {found['median']:.2f} m")
+        rows = {name: made(numbers, run) for name, run in tools.items()}
+        common = np.isfinite([errors for *_, errors in rows.values()]).all(axis=0)
+        print(*(row(f"{label}, {name}", *found, common) for name, found in rows.items()), sep="\n", flush=True)
+    figures, found, errors = made(tuple(sorted(path.stem for path in images.glob("0*.tif"))), run_ours, "--fill")
+    print(f"\n| {HEADS_PUBLISHED} |\n|{'---|' * len(HEADS_PUBLISHED.split(' | '))}\n{PUBLISHED}")
+    words = [f"{np.nanmean(errors):.2f} m", "", f"{figures['s']:.0f} s", f"{CORES} cores, {figures['MB']:.0f} MB"]
+    words += [f"coverage {found['coverage']:.3f}, median half width {found['half width']:.2f} m"]
+    print(f"| `surface --fill`, ten images | {' | '.join(words)} |")
+    print(f"\nten images: {100 * found['cells']:.1f} % of the cells, median error {np.nanmedian(errors):.2f} m")
 
 
 if __name__ == "__main__":
