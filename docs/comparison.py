@@ -119,8 +119,8 @@ def run_cars(images: list[Path], folder: Path, *_: object) -> tuple[dict[str, fl
             "geoid": False,
             "auxiliary": {"performance_map": [0]},
         },
-        "orchestrator": {"mode": "multiprocessing", "nb_workers": CORES},
-        "subsampling": {"advanced": {"resolutions": [1]}},
+        # With the usual 2000 MB it crops ranges of disparities, and loses tiles.
+        "orchestrator": {"mode": "multiprocessing", "nb_workers": CORES, "max_ram_per_worker": 4000},
         "surface_modeling": {"applications": {"all": maps}},
     }
     (folder / "cars.json").write_text(json.dumps(configuration, indent=1))
