@@ -119,8 +119,10 @@ def run_cars(images: list[Path], folder: Path, *_: object) -> tuple[dict[str, fl
             "geoid": False,
             "auxiliary": {"performance_map": [0]},
         },
-        # With the usual 2000 MB it crops ranges of disparities, and loses tiles.
+        # With the usual 2000 MB it crops ranges of disparities, and a tile fails.
         "orchestrator": {"mode": "multiprocessing", "nb_workers": CORES, "max_ram_per_worker": 4000},
+        # With the usual 16, 4, 1 the surface of 4 is empty, and CARS ends.
+        "subsampling": {"advanced": {"resolutions": [1]}},
         "surface_modeling": {"applications": {"all": maps}},
     }
     (folder / "cars.json").write_text(json.dumps(configuration, indent=1))
