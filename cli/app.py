@@ -57,8 +57,8 @@ _DAILY = (demo, surface, change, dsm, match, status, report, project, evaluate, 
 def keep_memory() -> None:
     """Let this process use memory of arrays again: to have it cleared by the system takes 5 % of a run's time."""
     if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):
-        for setting in (_TRIM_THRESHOLD, _MMAP_THRESHOLD):
-            mallopt(setting, 1 << 29)
+        mallopt(_MMAP_THRESHOLD, 1 << 29) or mallopt(_MMAP_THRESHOLD, 1 << 25)  # the most of old versions
+        mallopt(_TRIM_THRESHOLD, 1 << 29)
 
 
 class _Commands(click.Group):

@@ -43,8 +43,8 @@ def plan(
     """Estimate tiles, memory, disk and time of matching LEFT and RIGHT, or of a surface of two raw images or more.
 
     The time comes from a sample matched at the centre, or elsewhere if there is no data. Options are those of match;
-    with --resolution or --grid-like those of surface. Of a raw pair the middle is resampled, and its search range
-    found; of three images or more shifts, grid and heights are found.
+    with --resolution or --grid-like the images are raw: of two the middle is resampled, and its search range found; of
+    more shifts, grid and heights. Memory is that of matching.
     """
     from sat_intervals.cli.console import Console, lines_of_grid
     from sat_intervals.run.workers import parse_memory
@@ -91,7 +91,7 @@ def _planned(
 
     images, models = pair.open(), raw.pop("models")
     raw_only = raw | {"left_model": models[0], "right_model": models[1]}
-    is_surface = pair.more or grid["resolution"] or grid["grid_like"]
+    is_surface = pair.more or grid["resolution"] is not None or grid["grid_like"]
     if not pair.more:
         check_absent(_options(ground), "three images or more")
     if not is_surface:

@@ -25,8 +25,9 @@ def add_seconds(seconds: dict[str, float], more: Mapping[str, float]) -> None:
         seconds[stage] = seconds.get(stage, 0.0) + took
 
 
-def clocked(seconds: dict[str, float], progress: Progress) -> Progress:
-    """Return a callback that adds the seconds since its last call to the stage of that call."""
+@contextmanager
+def clocked(seconds: dict[str, float], progress: Progress) -> Iterator[Progress]:
+    """Give a callback that adds the seconds from each call to the next, or the end of the block, to its stage."""
     last = "start", time.perf_counter()
 
     def look(stage: str, done: int, total: int) -> None:
@@ -35,7 +36,8 @@ def clocked(seconds: dict[str, float], progress: Progress) -> Progress:
         add_seconds(seconds, {before[0]: last[1] - before[1]})
         progress(stage, done, total)
 
-    return look
+    yield look
+    add_seconds(seconds, {last[0]: time.perf_counter() - last[1]})
 
 
 @contextmanager

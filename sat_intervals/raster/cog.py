@@ -28,8 +28,6 @@ _CLASSIC = 1 << 32  # size from which a file is a BigTIFF
 # Tags of a TIFF directory, its types, and their sizes in bytes.
 _WIDTH, _HEIGHT, _BLOCK_WIDTH, _BLOCK_HEIGHT, _OFFSETS, _SIZES, _PLANES = 256, 257, 322, 323, 324, 325, 284
 _KEYS, _TEXTS = 34735, 34737  # of a CRS
-# Order of blocks in a ghost area, before its last line, and the digits of the area's size.
-_TILES, _LAST, _DIGITS = b"INTERLEAVE=TILE\n", b"KNOWN", slice(30, 36)
 _ASCII, _SHORT, _LONG, _LONG8 = 2, 3, 4, 16
 _BYTES = {1: 1, _ASCII: 1, _SHORT: 2, _LONG: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, _LONG8: 8}
 
@@ -61,16 +59,20 @@ def template(file: File, place: Georeferencing, tags: Mapping[str, str]) -> Temp
     # It is made in memory: GDAL says nothing of some failures to write to a disk.
     kind = {"count": len(file.bands), "dtype": file.dtype, "nodata": file.nodata, "sparse_ok": True}
     options = {"COMPRESS": file.compression.upper(), "PREDICTOR": file.predictor, "BLOCKSIZE": _SMALL}
-    kind |= tiled(file) | {"blockxsize": _SMALL, "blockysize": _SMALL, "height": _SMALL + 1, "width": _SMALL + 1}
+    # its bands are side by side, since the ghost area of newer versions would say that each follows the other
+    kind |= tiled(file) | {
+        "interleave": "pixel",
+        "blockxsize": _SMALL,
+        "blockysize": _SMALL,
+        "height": _SMALL + 1,
+        "width": _SMALL + 1,
+    }
     with Env(GDAL_TIFF_ENDIANNESS="LITTLE"), MemoryFile() as small, MemoryFile() as made:
         with gdal.create(small.name, **kind, **place.creation_options()) as dataset:
             dataset.update_tags(**tags)
             file.describe(dataset)
         copy(small.name, made.name, driver="COG", SPARSE_OK="YES", OVERVIEW_RESAMPLING="NEAREST", **options)
         ghost, directories = _parsed(bytes(made.getbuffer()))
-    if len(file.bands) > 1:  # GDAL's driver can do this since 3.11
-        size = b"%06d" % (int(ghost[_DIGITS]) + len(_TILES))
-        ghost = ghost.replace(ghost[_DIGITS], size, 1).replace(_LAST, _TILES + _LAST)
     whole = directories[0]
     level = tags.get("HEIGHTS", "")
     if file.is_of_heights and level.startswith("above") and place.crs and _KEYS in whole:

@@ -80,6 +80,7 @@ class EachOnWorkers:
             self.progress(stage, min(shape[0], BLOCK * done), shape[0])
 
         _remove(parts)
+        look(0)
         try:
             noted = finish_parts(parts, connection, row, failed, look)
             copy_parts(parts, noted, writer, None if store else connection, self.progress)

@@ -5,6 +5,7 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -177,12 +178,12 @@ def copy_parts(
 
     with nullcontext(workers) if workers else closing(Threads(_THREADS)) as copiers:
 
-        def copy(path: Path, of_file: Iterable[tuple[int, Part]]) -> None:
+        def copy(final: Path, path: Path, of_file: Iterable[tuple[int, Part]]) -> None:
             tasks = (
                 Task(part.source, copy_part, (parts, *part.source, path.absolute(), offset), parts.retries)
                 for offset, part in of_file
             )
-            for _, name in results(copiers, tasks, lambda _: f"a part of {path} could not be copied", look):
+            for _, name in results(copiers, tasks, lambda _: f"{final} could not be written", look):
                 copied.append(name)
 
         look(0)
@@ -191,7 +192,7 @@ def copy_parts(
                 [Part(metas[level, row]["blocks"][file.name], ((level, row), file.name)) for row in range(count)]
                 for level, count in enumerate(parts.rows)
             ]
-            writer.assemble(file.name, levels, copy)
+            writer.assemble(file.name, levels, partial(copy, writer.folder / file.name))
     if damaged := sorted({name for name in copied if name}):
         raise parts.damaged(damaged)
 

@@ -653,7 +653,7 @@ def test_plan__of_a_raw_pair_resamples_its_middle_and_counts_tiles_of_all(made, 
         assert dataset.shape == (height, width)
         whole = dataset.read(1)
     parts = []
-    monkeypatch.setattr(plan, "_MIDDLE", 400)
+    monkeypatch.setattr(plan, "_PARTS", (60, 400))
     monkeypatch.setattr(plan, "found_range", lambda left, *rest: parts.append(read_layers(left.path)[0]) or rest[1])
     result = invoke("plan", *raw, *SETTINGS, "--disparity", -45, 15, "--tile-size", 128, "--json")
     assert result.exit_code == 0, result.output

@@ -90,10 +90,6 @@ def test_assemble__is_a_valid_file_with_every_level(tmp_path, monkeypatch, file,
     with rasterio.open(path) as dataset:
         assert (dataset.tags()["ALPHA"], dataset.tags(1)["meaning"]) == ("0.9", file.bands[0].meaning)
         assert Georeferencing.of(dataset) == PLACE
-    area = path.read_bytes()[16 if is_big else 8 :]
-    lines = area[43 : 43 + int(area[30:36])].decode()
-    assert lines.endswith("\nKNOWN_INCOMPATIBLE_EDITION=NO\n ")
-    assert ("INTERLEAVE=TILE\n" in lines) == (len(bands) > 1)
 
 
 def test_halved__is_the_mean_of_what_is_known_and_every_other_flag():

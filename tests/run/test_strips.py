@@ -127,7 +127,7 @@ def test_match_pair__names_the_file_that_cannot_be_written(tall, tmp_path, monke
     out = with_tiles(tall, tmp_path / "out")
     with monkeypatch.context() as patch:
         patch.setattr(parts_of_files, "copy_part", full)
-        message = r"out/.intervals.tif.part could not be copied: No space left on device: free disk space and rerun the"
+        message = "out/intervals.tif could not be written: No space left on device: free disk space and rerun the"
         with pytest.raises(RunError, match=message):
             matched(tall, out, cluster={"retries": 0})
     assert not list(out.glob("*.tif*"))
