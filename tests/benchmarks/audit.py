@@ -1,4 +1,4 @@
-"""The table of docs/volumes.md: disparities of OpenCV's SGBM on WorldView-3 pairs, audited by `intervals_around`."""
+"""Figures of docs/volumes.md: disparities of OpenCV's SGBM on WorldView-3 pairs, audited by `intervals_around`."""
 
 import json
 import os
