@@ -29,17 +29,15 @@ from sat_intervals.tiling import Window
 RESOLUTION, CRS, BAND, CORES = 0.5, 32617, 2, os.cpu_count()
 PAIR, THREE = ("003", "004"), ("003", "004", "005")
 HEADS = (
-    "images, tool | time | processor time | memory | cells with a height | median error | mean error | coverage | "
-    "median half width"
+    "images, tool | time, s | processor time, s | memory, MB | cells, % | median error, m | mean error, m | coverage | "
+    "half width, m"
 )
-HEADS_PUBLISHED = "method | mean error here | mean of four places | time | needs | error bars"
+HEADS_PUBLISHED = "method | mean error here, m | mean of four places, m | time | needs"
 # Figures of papers, which this script does not measure; see comparison.md.
 PUBLISHED = """\
-| [EOGS++](https://arxiv.org/abs/2511.16542), 19 images | 0.93 m | | 25 min | GPU, 24 GB | none |
-| [EOGS](https://arxiv.org/abs/2412.13047), 19 images | 1.09 m | 1.46 m | 3 min | GPU | none |
-| EO-NeRF, by EOGS | | 1.35 m | 15 h | GPU | none |
-| SAT-NGP, by EOGS | | 1.72 m | 25 min | GPU | none |
-| s2p, by EOGS | | 1.53 m | 20 min | | none |"""
+| [EOGS++](https://arxiv.org/abs/2511.16542), 19 images | 0.93 | | minutes | GPU, 24 GB |
+| [EOGS](https://arxiv.org/abs/2412.13047), 19 images | 1.09 | 1.46 | 3 min | GPU |
+| EO-NeRF, by EOGS | | 1.35 | 15 h | GPU |"""
 
 
 def command(name: str) -> str | None:
@@ -173,10 +171,9 @@ def judged(surface: Path, lidar: Path) -> tuple[dict[str, float], np.ndarray]:
 
 def row(name: str, made: dict[str, float], found: dict[str, float], errors: np.ndarray, common: np.ndarray) -> str:
     """Return a row of the first table."""
-    words = [name, f"{made['s']:.0f} s", f"{made['processor s']:.0f} s", f"{made['MB']:.0f} MB"]
-    words += [f"{100 * found['cells']:.0f} %"]
-    words += [f"{of(errors):.2f} m ({of(errors[common]):.2f} m)" for of in (np.nanmedian, np.nanmean)]
-    words += [f"{found['coverage']:.3f}", f"{found['half width']:.2f} m"] if "coverage" in found else ["none", ""]
+    words = [name, *(f"{made[key]:.0f}" for key in ("s", "processor s", "MB")), f"{100 * found['cells']:.0f}"]
+    words += [f"{of(errors):.2f} ({of(errors[common]):.2f})" for of in (np.nanmedian, np.nanmean)]
+    words += [f"{found['coverage']:.3f}", f"{found['half width']:.2f}"] if "coverage" in found else ["none", ""]
     return f"| {' | '.join(words)} |"
 
 
@@ -200,10 +197,10 @@ def main(images: Path, out: Path) -> None:
         print(*(row(f"{label}, {name}", *found, common) for name, found in rows.items()), sep="\n", flush=True)
     figures, found, errors = made(tuple(sorted(path.stem for path in images.glob("0*.tif"))), run_ours, "--fill")
     print(f"\n| {HEADS_PUBLISHED} |\n|{'---|' * len(HEADS_PUBLISHED.split(' | '))}\n{PUBLISHED}")
-    words = [f"{np.nanmean(errors):.2f} m", "", f"{figures['s']:.0f} s", f"{CORES} cores, {figures['MB']:.0f} MB"]
-    words += [f"coverage {found['coverage']:.3f}, median half width {found['half width']:.2f} m"]
+    words = [f"{np.nanmean(errors):.2f}", "", f"{figures['s']:.0f} s", f"{CORES} cores, {figures['MB']:.0f} MB"]
     print(f"| `surface --fill`, ten images | {' | '.join(words)} |")
     print(f"\nten images: {100 * found['cells']:.1f} % of the cells, median error {np.nanmedian(errors):.2f} m")
+    print(f"coverage {found['coverage']:.3f}, half width {found['half width']:.2f} m")
 
 
 if __name__ == "__main__":
