@@ -25,7 +25,9 @@ _GRID_OPTIONS = (
     click.option("--resolution", type=float, metavar="METRES", help="Side of a cell; or give --grid-like."),
     click.option("--grid-like", type=options.FILE, help="North-up raster whose grid and CRS the surface takes."),
     click.option("--crs", metavar="EPSG", help="A projected CRS in metres; default the UTM zone of the points."),
-    click.option("--geoid", type=options.FILE, help="Geoid grid (GTX, GeoTIFF) that heights refer to."),
+    click.option(
+        "--geoid", type=options.FILE, help="Geoid grid (GTX, GeoTIFF) that heights refer to; default the ellipsoid."
+    ),
 )
 _CELL_OPTIONS = (
     *_GRID_OPTIONS[:3],

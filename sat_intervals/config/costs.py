@@ -235,7 +235,7 @@ class Sweep(_Cost):
     method: Literal["sweep"] = Field("sweep", description="many images, compared at heights above the ground")
     share: Exact = Field(Decimal("0.4"), gt=0, le=1, description="of the pairs that see a cell, the best that count")
     pairs: int = Field(3, ge=1, le=16, description="pairs of images to compare, for each image")
-    step: float | None = Field(None, gt=0, description="metres between heights; null: half a pixel of parallax")
+    step: float | None = Field(None, gt=0, description="metres between heights; null: half a cell of parallax")
     doubtful: float = Field(0.05, ge=0, lt=1, description="share of cells, of lowest confidence, without height")
 
     window: ClassVar = 5
