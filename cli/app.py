@@ -4,7 +4,6 @@ Each command imports the library itself, so that help and usage errors do not wa
 """
 
 import atexit
-import ctypes
 import errno
 import gc
 from collections.abc import Sequence
@@ -36,8 +35,6 @@ from sat_intervals.cli.surface import surface
 from sat_intervals.cli.triangulate import triangulate
 
 FAILED, USER_ERROR = 1, 2
-# Settings of glibc: sizes of free memory and of an array from which on it gives memory back.
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 # Packages of extras.
 _EXTRAS = {"matplotlib": "plot", "scipy": "dsm", "pyogrio": "reference", "shapely": "reference"}
 _ITEM = "\n  "
@@ -54,13 +51,6 @@ STEPS: dict[str, tuple[click.Command, ...]] = {
 _DAILY = (demo, surface, change, dsm, match, status, report, project, evaluate, export)
 
 
-def keep_memory() -> None:
-    """Let this process use memory of arrays again: to have it cleared by the system takes 5 % of a run's time."""
-    if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):
-        mallopt(_MMAP_THRESHOLD, 1 << 29) or mallopt(_MMAP_THRESHOLD, 1 << 25)  # the most of old versions
-        mallopt(_TRIM_THRESHOLD, 1 << 29)
-
-
 class _Commands(click.Group):
     """Group of commands; turns every error into one line and an exit status."""
 
@@ -73,7 +63,6 @@ class _Commands(click.Group):
         # imports and 0.5 s at the end.
         gc.set_threshold(5000)
         atexit.register(gc.freeze)
-        keep_memory()
         try:
             with armed():
                 return super().invoke(context)

@@ -32,7 +32,7 @@ DASK = {
     "distributed.admin.tick.interval": "1s",
     "distributed.worker.profile.enabled": False,
     # Its nannies let workers give memory back after each array: the system then takes a fourth of the time.
-    # Commands do the same, see `cli.app`; with one pool a process has 80 MB less.
+    # With one pool a process has 80 MB less.
     "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 1 << 29,
     "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 1 << 29,
     "distributed.nanny.pre-spawn-environ.MALLOC_ARENA_MAX": 1,

@@ -687,23 +687,3 @@ def test_match__refuses_the_folder_of_many_images(swept, folder):
     assert done.exit_code == 2
     assert f"{swept} already holds another run" in done.output
     assert "Traceback" not in done.output
-
-
-def test_keep_memory__arrays_of_threads_take_the_pages_of_earlier_ones():
-    script = """
-from resource import RUSAGE_SELF, getrusage
-from threading import Thread
-import numpy as np
-from sat_intervals.cli.app import keep_memory
-keep_memory()
-for count in (1, 20):
-    before = getrusage(RUSAGE_SELF).ru_minflt
-    for _ in range(count):
-        thread = Thread(target=np.ones, args=(1 << 22,))
-        thread.start()
-        thread.join()
-    print(getrusage(RUSAGE_SELF).ru_minflt - before)
-"""
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    first, others = map(int, done.stdout.split())
-    assert others < 5 * first
