@@ -32,12 +32,11 @@ HEADS = (
     "images, tool | time, s | processor time, s | memory, MB | cells, % | median error, m | mean error, m | coverage | "
     "half width, m"
 )
-HEADS_PUBLISHED = "method | mean error here, m | mean of four places, m | time | needs"
-# Figures of papers, which this script does not measure; see comparison.md.
+HEADS_PUBLISHED = "method | mean error here, m | time | needs"
+# Published figures, which this script does not measure; see comparison.md.
 PUBLISHED = """\
-| [EOGS++](https://arxiv.org/abs/2511.16542), 19 images | 0.93 | | minutes | GPU, 24 GB |
-| [EOGS](https://arxiv.org/abs/2412.13047), 19 images | 1.09 | 1.46 | 3 min | GPU |
-| EO-NeRF, by EOGS | | 1.35 | 15 h | GPU |"""
+| [EOGS++](https://arxiv.org/abs/2511.16542), 19 images | 0.93 | minutes | GPU, 24 GB |
+| [EOGS](https://arxiv.org/abs/2412.13047), 19 images | 1.09 | minutes | GPU |"""
 
 
 def command(name: str) -> str | None:
@@ -197,7 +196,7 @@ def main(images: Path, out: Path) -> None:
         print(*(row(f"{label}, {name}", *found, common) for name, found in rows.items()), sep="\n", flush=True)
     figures, found, errors = made(tuple(sorted(path.stem for path in images.glob("0*.tif"))), run_ours, "--fill")
     print(f"\n| {HEADS_PUBLISHED} |\n|{'---|' * len(HEADS_PUBLISHED.split(' | '))}\n{PUBLISHED}")
-    words = [f"{np.nanmean(errors):.2f}", "", f"{figures['s']:.0f} s", f"{CORES} cores, {figures['MB']:.0f} MB"]
+    words = [f"{np.nanmean(errors):.2f}", f"{figures['s']:.0f} s", f"{CORES} cores, {figures['MB']:.0f} MB"]
     print(f"| `surface --fill`, ten images | {' | '.join(words)} |")
     print(f"\nten images: {100 * found['cells']:.1f} % of the cells, median error {np.nanmedian(errors):.2f} m")
     print(f"coverage {found['coverage']:.3f}, half width {found['half width']:.2f} m")
