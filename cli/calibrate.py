@@ -1,6 +1,5 @@
 """``sat-intervals calibrate``: find the levels that reach a coverage, on pairs with known truth."""
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +7,7 @@ import click
 
 from sat_intervals.cli import options
 from sat_intervals.cli.calibrate_dsm import calibrate_heights
-from sat_intervals.cli.matching import SettingsArguments, settings_options
+from sat_intervals.cli.matching import SettingsArguments, unlevelled_options
 
 
 @click.command(cls=options.Grouped, short_help="Find what intervals need for a coverage, with a truth.")
@@ -32,7 +31,7 @@ from sat_intervals.cli.matching import SettingsArguments, settings_options
     metavar="C",
     help="With --dsm: coverage that the margins must reach, .5 to .99; default: the coverage of the runs.",
 )
-@partial(settings_options, levels=False)
+@unlevelled_options
 def calibrate(
     pairs: tuple[Path, ...],
     output: Path,

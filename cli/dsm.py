@@ -1,8 +1,6 @@
 """``sat-intervals dsm``: make a surface model with height intervals."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -81,9 +79,8 @@ _CELL_OPTIONS = (
 )
 
 
-def grid_options(command: options.Command) -> options.Command:
-    """Add options for the grid of a surface, and what its heights refer to."""
-    return options.with_options(command, *_GRID_OPTIONS)
+# The command gets ``grid``: the grid of a surface, and what its heights refer to.
+grid_options = options.gathered("grid", dict, *_GRID_OPTIONS)
 
 
 def side_of(resolution: float | None, grid_like: Path | None) -> float | Path:
@@ -94,39 +91,32 @@ def side_of(resolution: float | None, grid_like: Path | None) -> float | Path:
     return side
 
 
-def cell_options(command: options.Command) -> options.Command:
-    """Add options for the cells of a surface, beside a `calibration_option`: ``cells``, arguments of `make_surface`."""
+def _cells(
+    *,
+    grid_like: Path | None,
+    height_calibration: Path | None,
+    fills: bool,
+    fill_distance: float | None,
+    resolution: float | None,
+    **others: Any,
+) -> dict[str, Any]:
+    """Return arguments of `make_surface`."""
+    from sat_intervals.config import load_height_calibration
+    from sat_intervals.heights.choices import SurfaceChoices
 
-    @wraps(command)
-    def with_cells(**given: Any) -> Any:
-        names = "bounds keeps_open keeps_border outliers max_width min_confidence flatten mask ortho"
-        choices = {name: given.pop(name) for name in names.split()}
-        distance = given.pop("fill_distance")
-        fills = given.pop("fills")
-        choices["fill"] = _FILL_DISTANCE if fills and distance is None else distance
-        calibration = given.pop("height_calibration")
-        cells = {name: given.pop(name) for name in ("resolution", "crs", "radius", "geoid")}
-        grid_like = given.pop("grid_like")
-        if cells["resolution"] or grid_like:  # a surface that is only completed has its own
-            cells["resolution"] = side_of(cells["resolution"], grid_like)
-        from sat_intervals.config import load_height_calibration
-        from sat_intervals.heights.choices import SurfaceChoices
-
-        choices["calibration"] = calibration and load_height_calibration(calibration)
-        cells["choices"] = SurfaceChoices(**choices)
-        return command(cells=cells, **given)
-
-    return options.with_options(with_cells, *_CELL_OPTIONS)
+    # a surface that is only completed has its own
+    side = side_of(resolution, grid_like) if resolution or grid_like else resolution
+    others["fill"] = _FILL_DISTANCE if fills and fill_distance is None else fill_distance
+    others["calibration"] = height_calibration and load_height_calibration(height_calibration)
+    cells = {name: others.pop(name) for name in ("crs", "radius", "geoid")}
+    return cells | {"resolution": side, "choices": SurfaceChoices(**others)}
 
 
-def calibration_option(*names: str) -> Callable[[options.Command], options.Command]:
-    """Return an option for the calibration that `cell_options` reads."""
-    return click.option(
-        *names,
-        "height_calibration",
-        type=options.FILE,
-        help="Calibration written by calibrate --dsm: margins in metres that move the bounds.",
-    )
+def cell_options(calibration: str) -> options.Decorator:
+    """Add options for the cells of a surface, that of their calibration by its name; the command gets ``cells``."""
+    text = "Calibration written by calibrate --dsm: margins in metres that move the bounds."
+    option = click.option(calibration, "height_calibration", type=options.FILE, help=text)
+    return options.gathered("cells", _cells, *_CELL_OPTIONS, option)
 
 
 def say_surface(console: "Console", report: dict[str, Any]) -> None:
@@ -171,8 +161,7 @@ def say_surface(console: "Console", report: dict[str, Any]) -> None:
 
 @click.command(cls=options.Grouped, short_help="Make a surface model of one or several finished runs.")
 @click.argument("outs", metavar="OUT...", nargs=-1, required=True, type=options.FILE)
-@cell_options
-@calibration_option("--calibration")
+@cell_options("--calibration")
 @click.option("--no-align", "aligns", flag_value=False, default=True, help="Do not move several OUT onto each other.")
 @click.option(
     "--reference", type=options.FILE, help="Raster of heights, above the same datum, that each OUT is moved onto."

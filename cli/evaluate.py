@@ -5,20 +5,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from sat_intervals.cli import options
 from sat_intervals.cli.evaluate_dsm import Details, details_options, evaluate_heights
 from sat_intervals.cli.logs import warn
 from sat_intervals.cli.matching import SettingsArguments, settings_options
-from sat_intervals.cli.options import (
-    FILE,
-    Grouped,
-    Printing,
-    Surface,
-    gathered,
-    json_option,
-    log_options,
-    surface_options,
-    tolerance_option,
-)
+from sat_intervals.cli.options import FILE, Printing, Surface
 
 if TYPE_CHECKING:
     from sat_intervals.evaluate.paper import SceneMetrics
@@ -27,7 +18,7 @@ if TYPE_CHECKING:
 _BIAS = 0.25
 
 
-@click.command(cls=Grouped, short_help="Compare intervals, or heights of a surface, with a truth.")
+@click.command(cls=options.Grouped, short_help="Compare intervals, or heights of a surface, with a truth.")
 @click.argument("folders", metavar="[OUT]...", nargs=-1, type=FILE)
 @click.option("--truth", "truths", type=FILE, multiple=True, help="True disparity; one for each OUT, in that order.")
 @click.option(
@@ -35,17 +26,21 @@ _BIAS = 0.25
 )
 @click.option("--remove-bias", is_flag=True, help="Add the median of disparity - truth to the truth first.")
 @click.option("--group", metavar="LABEL", help="Put all scenes in this group; ignore meta.json.")
-@surface_options(
+@options.surface_options(
     "Evaluate this surface model against --reference, instead of runs.",
     "runs and pairs",
     *("classes", "within", "pictures", "line", "overwrite"),
 )
 @details_options
 @settings_options
-@tolerance_option
-@json_option
-@gathered("printing", Printing, click.option("--quiet", "-q", is_flag=True, help="Print figures and errors only."))
-@log_options
+@options.tolerance_option
+@options.gathered(
+    "printing",
+    Printing,
+    options.json_option,
+    click.option("--quiet", "-q", is_flag=True, help="Print figures and errors only."),
+)
+@options.log_options
 def evaluate(
     folders: tuple[Path, ...],
     surface: Surface | None,

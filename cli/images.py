@@ -1,12 +1,11 @@
 """Options shared by the commands that take images: two or many, masks, no-data values, bands, the region to match."""
 
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.options import NAME, Command, Decorator, expert_option, gathered
+from sat_intervals.cli.options import NAME, expert_option, gathered
 
 if TYPE_CHECKING:
     from sat_intervals.raster import Image
@@ -79,47 +78,29 @@ _IMAGE_OPTIONS = (
     ),
     expert_option("--band", type=_Both(int), metavar="N", help="Band to match in the images, or LEFT,RIGHT."),
 )
-# The command gets ``pair``.
 _PAIR = click.argument("left", type=NAME), click.argument("right", type=NAME)
-image_options = gathered("pair", PairArguments, *_PAIR, *_IMAGE_OPTIONS)
+_IMAGES = click.argument("images", metavar="LEFT RIGHT [MORE...]", nargs=-1, required=True, type=NAME)
+_WINDOW = click.option(
+    "--window", "region", type=int, nargs=4, metavar="ROW COL HEIGHT WIDTH", help="Region of the left image to match."
+)
 
 
-def _of_many(
-    *,
-    images: tuple[str, ...],
-    left_mask: str | None,
-    right_mask: str | None,
-    nodata: tuple[float, float] | None,
-    band: tuple[int, int] | None,
-    region: tuple[int, int, int, int] | None,
-) -> PairArguments:
+def _of_many(*, images: tuple[str, ...], **given: Any) -> PairArguments:
     """Return the first two images as a pair, with the others beside it."""
     if len(images) < 2:
         raise click.UsageError("give two images or more.")
-    return PairArguments(images[0], images[1], left_mask, right_mask, nodata, band, region, images[2:])
+    return PairArguments(images[0], images[1], **given, more=images[2:])
 
 
-_IMAGES = click.argument("images", metavar="LEFT RIGHT [MORE...]", nargs=-1, required=True, type=NAME)
-
-
-def pair_options(command: Command, images: Decorator = image_options) -> Command:
-    """Add options for an epipolar pair and the region to match; the command gets ``pair``, a `PairArguments`."""
-    names = "--window", "region"
-    text = "Region of the left image to match."
-    return images(click.option(*names, type=int, nargs=4, metavar="ROW COL HEIGHT WIDTH", help=text)(command))
-
-
-many_options = partial(pair_options, images=gathered("pair", _of_many, _IMAGES, *_IMAGE_OPTIONS))
-
-
-def _ground(*, extent: tuple[float, float, float, float] | None, heights: tuple[float, float] | None) -> dict[str, Any]:
-    return {"extent": extent, "heights": heights}
-
+# The command gets ``pair``, a `PairArguments`: of two images, with the region to match, or of more.
+image_options = gathered("pair", PairArguments, *_PAIR, *_IMAGE_OPTIONS)
+pair_options = gathered("pair", PairArguments, *_PAIR, *_IMAGE_OPTIONS, _WINDOW)
+many_options = gathered("pair", _of_many, _IMAGES, *_IMAGE_OPTIONS, _WINDOW)
 
 # The command gets ``ground``: arguments of `surface`.
 ground_options = gathered(
     "ground",
-    _ground,
+    dict,
     expert_option(
         "--extent",
         type=float,

@@ -2,25 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.options import (
-    FILE,
-    NAME,
-    PRESETS,
-    Command,
-    Printing,
-    expert_option,
-    gathered,
-    json_option,
-    log_options,
-    quiet_option,
-    with_options,
-)
+from sat_intervals.cli import options
+from sat_intervals.cli.options import FILE, NAME, Command, Printing, expert_option, gathered
 
 if TYPE_CHECKING:
     from sat_intervals.config import Config
@@ -84,6 +72,32 @@ class RunArguments(Printing):  # type: ignore[misc,unused-ignore]
             raise RunError(f"{count}, see above, and --strict is given; the files are written")
 
 
+_SEARCH_OPTIONS = (
+    click.option(
+        "--disparity",
+        type=int,
+        nargs=2,
+        metavar="MIN MAX",
+        help="Search range in pixels, both ends searched; default: found from the images.",
+    ),
+    expert_option(
+        "--local-range",
+        is_flag=True,
+        default=None,
+        help="Search a separate range in each cell of the image, found from the images.",
+    ),
+    expert_option(
+        "--around", type=NAME, help="Disparities of another matcher, a raster: search around them and audit them."
+    ),
+    expert_option("--margin", type=int, metavar="K", help="Pixels to search on both sides of --around; default 8."),
+)
+_CONFIG_OPTION = click.option("--config", "config_file", type=FILE, help="Settings (YAML); the command line wins.")
+_PRESET_OPTION = click.option(
+    "--preset",
+    type=click.Choice(options.PRESETS),
+    help="satellite (default), satellite-mccnn for different dates or little texture, paper and mccnn for close "
+    "range, many for three images or more (surface takes it by itself).",
+)
 _LEVEL_OPTIONS = (
     click.option(
         "--coverage",
@@ -94,8 +108,7 @@ _LEVEL_OPTIONS = (
     click.option("--calibration", type=NAME, help="Calibration for --coverage; default the built-in one."),
     expert_option("--alpha", type=float, metavar="A", help="Level of possibility, above 0 to 1; no coverage."),
 )
-_CLUSTER_OPTIONS = (
-    click.option("--config", "config_file", type=FILE, help="Settings (YAML); the command line wins."),
+_WORKER_OPTIONS = (
     click.option("--workers", type=click.IntRange(min=1), help="Tiles at once; default one per core."),
     expert_option(
         "--cluster",
@@ -103,21 +116,12 @@ _CLUSTER_OPTIONS = (
         help="threads (default), processes, slurm, pbs, lsf, sge, or the address of a dask scheduler.",
     ),
 )
-_FIRST_SETTINGS = (
-    _CLUSTER_OPTIONS[0],
-    click.option(
-        "--preset",
-        type=click.Choice(PRESETS),
-        help="satellite (default), satellite-mccnn for different dates or little texture, paper and mccnn for close "
-        "range, many for three images or more (surface takes it by itself).",
-    ),
-)
-_LAST_SETTINGS = (
+_OTHER_OPTIONS = (
     expert_option(
         "--rows", type=click.Choice(("auto", "none")), help="Row offsets of the right image: taken out, or left."
     ),
     expert_option("--tile-size", type=int, help="Side of a tile's core in pixels, a multiple of 64."),
-    *_CLUSTER_OPTIONS[1:],
+    *_WORKER_OPTIONS,
     expert_option(
         "--set", "named", multiple=True, metavar="KEY=VALUE", help="Any other setting, such as tiles.overlap=100."
     ),
@@ -131,47 +135,37 @@ _PLACES = {
     "alpha": "interval.alpha",
     "tile_size": "tiles.size",
     "workers": "cluster.workers",
+    "local_range": "disparity.local",
+    "around": "disparity.around",
+    "margin": "disparity.margin",
 }
 
 
-def _clustered(*, config_file: Path | None, workers: int | None, cluster: str | None) -> SettingsArguments:
-    sections: dict[str, Any] = {}
-    _put(sections, "--workers", **{"cluster.workers": workers})
-    _put_cluster(sections, cluster)
-    return SettingsArguments(config_file, sections)
-
-
-def cluster_options(command: Command) -> Command:
-    """Add options for the workers alone; the command gets ``settings``."""
-    return gathered("settings", _clustered, *_CLUSTER_OPTIONS)(command)
-
-
-def _put_cluster(sections: dict[str, Any], cluster: str | None) -> None:
-    if cluster:
-        is_address = "://" in cluster
-        chosen = {"kind": "address", "address": cluster} if is_address else {"kind": cluster}
-        _put(sections, "--cluster", **{f"cluster.{key}": value for key, value in chosen.items()})
-
-
-def settings_options(command: Command, *, levels: bool = True) -> Command:
-    """Add options for settings; ``levels``: also --coverage, --calibration and --alpha."""
-
-    @wraps(command)
-    def with_settings(
-        *, config_file: Path | None, preset: str | None, cluster: str | None, named: tuple[str, ...], **others: Any
-    ) -> Any:
-        places = {name: key for name, key in _PLACES.items() if levels or not key.startswith("interval.")}
-        values = {name: others.pop(name) for name in places}
-        given = {"config": config_file, "preset": preset, "cluster": cluster, "set": named or None} | values
-        sections = _named(named)
-        _put(sections, "--preset", preset=preset)
-        for name, key in places.items():
-            _put(sections, f"--{name.replace('_', '-')}", **{key: values[name]})
-        _put_cluster(sections, cluster)
-        options = tuple(f"--{name.replace('_', '-')}" for name, value in given.items() if value is not None)
-        return command(settings=SettingsArguments(config_file, sections, options), **others)
-
-    return with_options(with_settings, *_FIRST_SETTINGS, *(_LEVEL_OPTIONS if levels else ()), *_LAST_SETTINGS)
+def _settings(
+    *,
+    config_file: Path | None,
+    cluster: str | None,
+    preset: str | None = None,
+    named: tuple[str, ...] = (),
+    disparity: tuple[int, int] | None = None,
+    **values: Any,
+) -> SettingsArguments:
+    """Return the settings that options give; ``values`` are those of _PLACES."""
+    values = {name: values.get(name) for name in _PLACES}
+    if values["margin"] is not None and values["around"] is None and config_file is None:
+        raise click.UsageError("--margin is for --around: give both.")
+    given = {"config": config_file, "preset": preset, "cluster": cluster, "set": named or None} | values
+    sections = _named(named)
+    _put(sections, "--preset", preset=preset)
+    for name, key in _PLACES.items():
+        _put(sections, f"--{name.replace('_', '-')}", **{key: values[name]})
+    address = cluster if cluster and "://" in cluster else None
+    kind = "address" if address else cluster or None
+    _put(sections, "--cluster", **{"cluster.kind": kind, "cluster.address": address})
+    minimum, maximum = disparity or (None, None)
+    _put(sections, "--disparity", **{"disparity.minimum": minimum, "disparity.maximum": maximum})
+    chosen = tuple(f"--{name.replace('_', '-')}" for name, value in given.items() if value is not None)
+    return SettingsArguments(config_file, sections, chosen)
 
 
 def _put(sections: dict[str, Any], option: str, **settings: Any) -> None:
@@ -206,46 +200,12 @@ def _named(settings: tuple[str, ...]) -> dict[str, Any]:
     return sections
 
 
-def _with_search(
-    *,
-    settings: SettingsArguments,
-    disparity: tuple[int, int] | None,
-    local_range: bool,
-    around: str | None,
-    margin: int | None,
-) -> SettingsArguments:
-    if disparity:
-        ends = {"disparity.minimum": disparity[0], "disparity.maximum": disparity[1]}
-        _put(settings.sections, "--disparity", **ends)
-    _put(settings.sections, "--local-range", **{"disparity.local": local_range or None})
-    if margin is not None and around is None and settings.file is None:
-        raise click.UsageError("--margin is for --around: give both.")
-    _put(settings.sections, "--around", **{"disparity.around": around})
-    _put(settings.sections, "--margin", **{"disparity.margin": margin})
-    return settings
-
-
-def search_options(command: Command) -> Command:
-    """Add options for the search range and for settings; the command gets ``settings``, which has both."""
-    return with_options(
-        settings_options(gathered("settings", _with_search)(command)),
-        click.option(
-            "--disparity",
-            type=int,
-            nargs=2,
-            metavar="MIN MAX",
-            help="Search range in pixels, both ends searched; default: found from the images.",
-        ),
-        expert_option(
-            "--local-range",
-            is_flag=True,
-            help="Search a separate range in each cell of the image, found from the images.",
-        ),
-        expert_option(
-            "--around", type=NAME, help="Disparities of another matcher, a raster: search around them and audit them."
-        ),
-        expert_option("--margin", type=int, metavar="K", help="Pixels to search on both sides of --around; default 8."),
-    )
+# The command gets ``settings``: of workers alone, of all but levels, of all, or of all with the search range.
+cluster_options = gathered("settings", _settings, _CONFIG_OPTION, *_WORKER_OPTIONS)
+unlevelled_options = gathered("settings", _settings, _CONFIG_OPTION, _PRESET_OPTION, *_OTHER_OPTIONS)
+_ALL = _CONFIG_OPTION, _PRESET_OPTION, *_LEVEL_OPTIONS, *_OTHER_OPTIONS
+settings_options = gathered("settings", _settings, *_ALL)
+search_options = gathered("settings", _settings, *_SEARCH_OPTIONS, *_ALL)
 
 
 def run_options(command: Command) -> Command:
@@ -261,7 +221,7 @@ def run_options(command: Command) -> Command:
             is_flag=True,
             help="May replace another run in OUT; its tiles are deleted, equal ones are used again.",
         ),
-        json_option,
-        quiet_option,
+        options.json_option,
+        options.quiet_option,
     )
-    return with_run(log_options(command))
+    return with_run(options.log_options(command))

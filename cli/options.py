@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial, wraps
-from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -77,12 +76,12 @@ NAME, FILE = _Name(is_path=False), _Name(is_path=True)
 
 def gathered(name: str, gather: Callable[..., Any], *options: Decorator) -> Decorator:
     """Return a decorator that adds options; the command gets ``name``, what ``gather`` makes of their values."""
-    parameters = signature(gather).parameters
+    names = [one.name or "" for one in click.command()(with_options(lambda: None, *options)).params]
 
     def decorated(command: Command) -> Command:
         @wraps(command)
         def with_gathered(**given: Any) -> Any:
-            values = {parameter: given.pop(parameter) for parameter in parameters if parameter in given}
+            values = {option: given.pop(option) for option in names}
             return command(**{name: gather(**values)}, **given)
 
         return with_options(with_gathered, *options)
@@ -134,18 +133,14 @@ def sensor_options(command: Command, *, models_alone: bool = False) -> Command:
             raise click.UsageError(f"{options} go together: give {'both' if len(given) == 2 else 'all four'}.")
         return list(zip(*given.values(), strict=True))
 
-    @wraps(command)
-    def with_files(**given: Any) -> Any:
-        names = "left_model", "right_model", "left_grid", "right_grid"
-        return command(sensor_files=gather(**{name: given.pop(name) for name in names}), **given)
-
-    return with_options(
-        with_files,
+    return gathered(
+        "sensor_files",
+        gather,
         click.option("--left-model", multiple=True, type=FILE, help="RPC model of the left sensor image."),
         click.option("--right-model", multiple=True, type=FILE, help="RPC model of the right sensor image."),
         click.option("--left-grid", multiple=True, type=FILE, help="Epipolar grid of the left image."),
         click.option("--right-grid", multiple=True, type=FILE, help="Epipolar grid of the right image."),
-    )
+    )(command)
 
 
 def note_geometry(outs: Sequence[Path], sensor_files: Sequence[SensorFiles]) -> None:

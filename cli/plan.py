@@ -38,7 +38,7 @@ def plan(
     as_json: bool,
     left_model: Path | None,
     right_model: Path | None,
-    **grid: Any,
+    grid: dict[str, Any],
 ) -> None:
     """Estimate tiles, memory, disk and time of matching LEFT and RIGHT, or of a surface of two raw images or more.
 

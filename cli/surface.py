@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from sat_intervals.cli.dsm import calibration_option, cell_options, say_surface
+from sat_intervals.cli.dsm import cell_options, say_surface
 from sat_intervals.cli.images import PairArguments, ground_options, many_options
 from sat_intervals.cli.matching import RunArguments, SettingsArguments, run_options, search_options
 from sat_intervals.cli.options import FILE, Grouped, sensor_options
@@ -19,8 +19,7 @@ from sat_intervals.cli.rectify import raw_options, say_rectified
 @click.argument("out", type=FILE)
 @partial(sensor_options, models_alone=True)
 @raw_options
-@cell_options
-@calibration_option("--height-calibration")
+@cell_options("--height-calibration")
 @ground_options
 @run_options
 def surface(
