@@ -1,7 +1,6 @@
 """``sat-intervals plan``: estimate tiles, memory, disk and time of a run."""
 
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -10,7 +9,7 @@ from sat_intervals.cli.dsm import grid_options, side_of
 from sat_intervals.cli.images import PairArguments, ground_options, many_options
 from sat_intervals.cli.matching import SettingsArguments, search_options
 from sat_intervals.cli.options import Grouped, json_option, log_options, say_json
-from sat_intervals.cli.rectify import model_options, raw_options
+from sat_intervals.cli.rectify import raw_pair_options
 
 if TYPE_CHECKING:
     from sat_intervals.config import Config
@@ -20,8 +19,7 @@ if TYPE_CHECKING:
 @click.command(cls=Grouped, short_help="Estimate tiles, memory, disk and time of a run.")
 @search_options
 @many_options
-@model_options
-@raw_options
+@raw_pair_options
 @grid_options
 @ground_options
 @click.option(
@@ -34,11 +32,9 @@ def plan(
     settings: SettingsArguments,
     ground: dict[str, Any],
     raw: dict[str, Any],
+    grid: dict[str, Any],
     memory: str | None,
     as_json: bool,
-    left_model: Path | None,
-    right_model: Path | None,
-    grid: dict[str, Any],
 ) -> None:
     """Estimate tiles, memory, disk and time of matching LEFT and RIGHT, or of a surface of two raw images or more.
 
@@ -52,7 +48,6 @@ def plan(
     config = settings.load(2 + len(pair.more))
     limit = parse_memory(memory) if memory else None
     with Console(quiet=as_json) as console:
-        raw |= {"models": (left_model, right_model)}
         made = _planned(pair, config, grid, ground, raw, memory=limit, progress=console.progress)
         if made.sweep:
             console.say_images(made.sweep)
@@ -89,22 +84,19 @@ def _planned(
     from sat_intervals.workflows.many import Wanted
     from sat_intervals.workflows.plan import plan_of_many, plan_of_raw
 
-    images, models = pair.open(), raw.pop("models")
-    raw_only = raw | {"left_model": models[0], "right_model": models[1]}
+    images = pair.open()
     is_surface = pair.more or grid["resolution"] is not None or grid["grid_like"]
     if not pair.more:
         check_absent(_options(ground), "three images or more")
     if not is_surface:
-        check_absent(_options(grid | raw_only), "surfaces, with --resolution or --grid-like")
+        check_absent(_options(grid | raw), "surfaces, with --resolution or --grid-like")
         return of_pair(images[0], images[1], config, window=pair.window, **how)
     check_absent({"--window": pair.region}, "epipolar images")
     side = side_of(grid.pop("resolution"), grid.pop("grid_like"))
     if pair.more:
-        check_absent(_options(raw_only), "two images")
+        check_absent(_options(raw), "two images")
         return plan_of_many(images, config, Wanted(side, **grid, **ground), **how)
-    cells = grid | {"resolution": side, "radius": None}
-    raw |= {"geoid": grid["geoid"] if raw["dem"] else None}
-    return plan_of_raw(images, config, cells, raw, models, **how)
+    return plan_of_raw(images, config, grid | {"resolution": side, "radius": None}, raw, **how)
 
 
 def _options(given: dict[str, Any]) -> dict[str, Any]:

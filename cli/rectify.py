@@ -14,46 +14,33 @@ if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
 
 
-_MODELS = (
+_MODEL_OPTIONS = (
     click.option("--left-model", type=options.FILE, help="RPC model of the left image; default that in or beside it."),
     click.option("--right-model", type=options.FILE, help="RPC model of the right image."),
 )
-
-
-def model_options(command: options.Command) -> options.Command:
-    """Add options for the models of two raw images."""
-    return options.with_options(command, *_MODELS)
-
-
-def _raw(*, dem: Path | None, altitude: float | None, resolution_of: str | None) -> dict[str, Any]:
-    return {"dem": dem, "altitude": altitude, "resolution_of": resolution_of}
-
-
-def raw_options(command: options.Command) -> options.Command:
-    """Add options for the grids of a raw pair; the command gets ``raw``, their values."""
-    return options.gathered(
-        "raw",
-        _raw,
-        click.option("--dem", type=options.FILE, help="Raw images: DEM whose heights have disparity 0."),
-        options.expert_option(
-            "--altitude",
-            type=float,
-            metavar="METRES",
-            help="Raw images: height above the ellipsoid that has disparity 0; default the middle of the ground's.",
-        ),
-        options.expert_option(
-            "--resolution-of",
-            type=click.Choice(("coarser", "left")),
-            help="Raw images: whose pixel size to take if they differ by more than 10 %; default coarser.",
-        ),
-    )(command)
+_RAW_OPTIONS = (
+    click.option("--dem", type=options.FILE, help="Raw images: DEM whose heights have disparity 0."),
+    options.expert_option(
+        "--altitude",
+        type=float,
+        metavar="METRES",
+        help="Raw images: height above the ellipsoid that has disparity 0; default the middle of the ground's.",
+    ),
+    options.expert_option(
+        "--resolution-of",
+        type=click.Choice(("coarser", "left")),
+        help="Raw images: whose pixel size to take if they differ by more than 10 %; default coarser.",
+    ),
+)
+# The command gets ``raw``: arguments of `rectify`, without models or with them.
+raw_options = options.gathered("raw", dict, *_RAW_OPTIONS)
+raw_pair_options = options.gathered("raw", dict, *_MODEL_OPTIONS, *_RAW_OPTIONS)
 
 
 @click.command(cls=options.Grouped, short_help="Make an epipolar pair of two raw images.")
 @image_options
 @click.argument("out", type=options.FILE)
-@model_options
-@raw_options
+@raw_pair_options
 @click.option("--geoid", type=options.FILE, help="Geoid grid that heights of --dem refer to; default the ellipsoid.")
 @cluster_options
 @options.overwrite_option

@@ -69,7 +69,7 @@ def match_batch(
         report = _Report(out, pairs)
         with Connection(common.cluster, out) as connection:
             each, pool = EachOnWorkers(connection, progress), pool_of(connection, out, progress)
-            jobs: dict[str, Job] = {}
+            jobs: list[Job] = []
             for number, pair in enumerate(pairs):
                 progress("pairs", number, len(pairs))
                 try:
@@ -80,7 +80,7 @@ def match_batch(
                         continue
                     stack.enter_context(locked(job.out))
                     if job.begin():
-                        jobs[pair.name] = job
+                        jobs.append(job)
                     else:
                         report.note({pair.name: _done_before(job, keep_tiles=keep_tiles)})
                 except Exception as error:  # one pair's failure must not stop the others
@@ -148,12 +148,12 @@ class _Surfaces:
         of_surfaces = [pair for pair in pairs if pair.resolution]
         if of_surfaces:
             import sat_intervals.heights.sensors  # noqa: F401 (without its extra it raises, for all pairs)
-        for pair in of_surfaces:
+        for pair in (one for one in of_surfaces if not one.more):
             try:
-                if not pair.more:
-                    check_cells(_cells(pair), replace(_choices(pair), calibration=None), None)
+                cells = _cells(pair)
+                check_cells(None, **cells | {"choices": replace(cells["choices"], calibration=None)})
                 if has_grids(pair.sensors):
-                    check_sensors(pair.sensors or (), pair.resolution or 0.0, pair.options.get("crs"), _choices(pair))
+                    check_sensors(pair.sensors or (), cells["resolution"], cells["crs"], cells["choices"])
             except SatIntervalsError as error:
                 self._errors[pair.name] = error
                 _LOG.warning("%s: there will be no surface: %s", pair.name, error)
@@ -162,47 +162,39 @@ class _Surfaces:
         self, pair: PairOfBatch, settings: Config, each: EachOnWorkers, pool: EachOnWorkers, *, keep_tiles: bool
     ) -> Job | None:
         """Return what is to be matched of a row, rectified by a pool; None of more images whose surface is there."""
-        out, overwrite = self._out / pair.name, self._overwrite
-        if not pair.more:
-            if pair.resolution and (choices := _choices(pair)).calibration:
-                check_cells(_cells(pair), choices, resolved(settings).interval)
-            images = self._epipolar(pair, out, pool)
-            how: dict[str, Any] = {"overwrite": overwrite, "pair": pair.name, "each": each}
-            return open_job(*images, out, settings, window=_window(pair), **how)
-        options: dict[str, Any] = {name: pair.options.get(name) for name in ("crs", "geoid", "extent", "heights")}
-        wanted = Wanted(pair.resolution or 0.0, **options, choices=_choices(pair))
-        asked = asked_of(_opened(pair), out, settings, wanted, overwrite=overwrite)
-        if not overwrite and complete_sweep(asked, out, keep_tiles=keep_tiles):
-            return None
-        job = sweep_job(asked, out, each, overwrite=overwrite, pair=pair.name)
-        if wanted.choices.ortho:
-            self._orthos[pair.name] = job
-        return job
-
-    def _epipolar(self, pair: PairOfBatch, out: Path, pool: EachOnWorkers) -> tuple[Image, Image]:
-        """Return the images to match: those of a pair, or the epipolar pair of its raw images."""
-        images, sensors = _opened(pair), pair.sensors or ()
-        if not pair.resolution:
-            return images[0], images[1]
-        raw = {name: pair.options.get(name) for name in ("dem", "altitude", "resolution_of")}
-        raw |= {"geoid": pair.options.get("geoid") if raw["dem"] else None, "overwrite": self._overwrite}
-        made = epipolar_pair(images, out, pool, sensors, _window(pair), self._on_rectified, **raw)
-        if pair.options.get("ortho"):
-            raw_inputs(made.left.path, made.right.path)
-        if not has_grids(sensors):
-            check_sensors(made.sensors, pair.resolution, pair.options.get("crs"), _choices(pair))
-        self._sensors[pair.name] = made.sensors
-        return made.left, made.right
+        out, cells, (left, right, *more) = self._out / pair.name, _cells(pair), _opened(pair)
+        how: dict[str, Any] = {"overwrite": self._overwrite, "pair": pair.name}
+        if more:
+            asked = asked_of([left, right, *more], out, settings, Wanted(**cells), overwrite=self._overwrite)
+            if not self._overwrite and complete_sweep(asked, out, keep_tiles=keep_tiles):
+                return None
+            job = sweep_job(asked, out, each, **how)
+            if asked.wanted.choices.ortho:
+                self._orthos[pair.name] = job
+            return job
+        window = Window(*pair.window) if pair.window else None
+        if cells["choices"].calibration:
+            check_cells(resolved(settings).interval, **cells)
+        if pair.resolution:
+            raw = _given(pair, "dem", "altitude", "resolution_of") | {"overwrite": self._overwrite}
+            raw["geoid"] = cells["geoid"] if raw["dem"] else None
+            made = epipolar_pair((left, right), out, pool, pair.sensors or (), window, self._on_rectified, **raw)
+            left, right = made.left, made.right
+            if cells["choices"].ortho:
+                raw_inputs(left.path, right.path)
+            if not has_grids(pair.sensors):
+                check_sensors(made.sensors, pair.resolution, cells["crs"], cells["choices"])
+            self._sensors[pair.name] = made.sensors
+        return open_job(left, right, out, settings, window=window, each=each, **how)
 
     def made(self, pair: PairOfBatch, pool: EachOnWorkers) -> dict[str, Any]:
         """Make the surface of a matched pair, or the ortho-image of more; return what it adds to the pair's state."""
         try:
             if pair.name in self._errors:
                 raise self._errors[pair.name]
-            out = self._out / pair.name
-            if not pair.more:
-                cells = _cells(pair) | {"choices": _choices(pair)}
-                return {"surface": surface_of(out, self._sensors[pair.name], pool, **cells)}
+            if pair.name in self._sensors:
+                made = surface_of(self._out / pair.name, self._sensors[pair.name], pool, **_cells(pair))
+                return {"surface": made}
             if pair.name in self._orthos:
                 write_ortho(self._orthos[pair.name], pool.progress)
             return {}
@@ -210,15 +202,18 @@ class _Surfaces:
             return _failed(error)
 
 
+def _given(pair: PairOfBatch, *options: str) -> dict[str, Any]:
+    return {name: pair.options.get(name) for name in options}
+
+
 def _cells(pair: PairOfBatch) -> dict[str, Any]:
-    return {"resolution": pair.resolution} | {name: pair.options.get(name) for name in ("crs", "radius", "geoid")}
-
-
-def _choices(pair: PairOfBatch) -> SurfaceChoices:
+    """Return arguments of `surface_of`, of more images the fields of `Wanted`."""
     file = pair.options.get("height_calibration")
-    how: dict[str, Any] = {name: pair.options.get(name) for name in ("fill", "flatten", "mask")}
     margins = load_height_calibration(file) if file else None
-    return SurfaceChoices(calibration=margins, ortho=pair.options.get("ortho", False), **how)
+    ortho = pair.options.get("ortho", False)
+    choices = SurfaceChoices(calibration=margins, ortho=ortho, **_given(pair, "fill", "flatten", "mask"))
+    given = _given(pair, "crs", "geoid", *(("extent", "heights") if pair.more else ("radius",)))
+    return given | {"resolution": pair.resolution, "choices": choices}
 
 
 def _opened(pair: PairOfBatch) -> list[Image]:
@@ -229,10 +224,6 @@ def _opened(pair: PairOfBatch) -> list[Image]:
         return open_image(path, **options, mask=mask)
 
     return [opened(path, *side) for path, side in zip(pair.images, sides + [("", None)] * len(pair.more), strict=True)]
-
-
-def _window(pair: PairOfBatch) -> Window | None:
-    return Window(*pair.window) if pair.window else None
 
 
 def _done_before(job: Job, *, keep_tiles: bool) -> dict[str, Any]:
@@ -265,19 +256,18 @@ def _raise_file_limit() -> None:
 
 
 def _matched(
-    jobs: Mapping[str, Job], workers: Workers, progress: Progress, *, keep_tiles: bool
+    jobs: Sequence[Job], workers: Workers, progress: Progress, *, keep_tiles: bool
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """Match the tiles of all jobs; assemble finished jobs in a thread meanwhile."""
     if not jobs:
         return
-    for job in jobs.values():
+    for job in jobs:
         compile_for(job)
     assembling: dict[Future[dict[str, Any]], str] = {}
     with _thread() as (thread, check):
-        names = {id(job): name for name, job in jobs.items()}
         assembled = partial(_assembled, workers, check, keep_tiles=keep_tiles)
-        for matched in match_jobs(workers, list(jobs.values()), progress):
-            assembling[thread.submit(assembled, matched)] = names[id(matched.job)]
+        for matched in match_jobs(workers, jobs, progress):
+            assembling[thread.submit(assembled, matched)] = matched.job.out.name
             for future in [future for future in assembling if future.done()]:
                 yield assembling.pop(future), future.result()
         total = len(assembling)

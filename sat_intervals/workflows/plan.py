@@ -66,7 +66,6 @@ def plan_of_raw(
     config: Config,
     cells: dict[str, Any],
     raw: dict[str, Any],
-    models: Sequence[Path | None] = (),
     *,
     memory: int | None = None,
     progress: Progress = lambda stage, done, total: None,
@@ -74,14 +73,15 @@ def plan_of_raw(
     """Estimate tiles, memory, disk and time of the surface of a raw pair, see `surface`, from its middle."""
     check_cost(config)
     choices = SurfaceChoices()
-    check_cells(cells, choices, resolved(config).interval)
+    check_cells(resolved(config).interval, **cells, choices=choices)
     _, resolution, crs, radius = checked_cells(**cells)
-    cells = {"resolution": resolution, "crs": crs, "radius": radius, "geoid": cells["geoid"]}
+    cells |= {"resolution": resolution, "crs": crs, "radius": radius, "choices": choices}  # not the grid of a raster
+    raw |= {"geoid": cells["geoid"] if raw["dem"] else None}
     with TemporaryDirectory() as name:
         for side in _PARTS:
             folder, start = Path(name) / str(side), dict[str, float]()
             with clocked(start, progress) as look, Connection(Cluster(workers=1), folder) as connection:
-                record = rectified(images, folder, models, EachOnWorkers(connection, look), side=side, **raw)
+                record = rectified(images, folder, EachOnWorkers(connection, look), side=side, **raw)
         left, right = (open_image(folder / one) for one in IMAGES)
         sensors = rectified_files(left.path, right.path) or ()
         check_sensors(sensors, resolution, crs, choices)
@@ -94,7 +94,7 @@ def plan_of_raw(
             for _ in range(2):  # the first compiles kernels
                 of_cells = dict[str, float]()
                 with clocked(of_cells, lambda *_: None) as look, Connection(one.cluster, out) as workers:
-                    surface_of(out, sensors, EachOnWorkers(workers, look), **cells, choices=choices)
+                    surface_of(out, sensors, EachOnWorkers(workers, look), **cells)
             share = window.height * window.width / (left.height * left.width)
             seconds["start"] += once
             seconds["files"] += of_cells["files"] + share * start["files"]

@@ -72,18 +72,17 @@ def rectify(
     SatIntervalsError
         Images, models or heights cannot be used, or the folder holds a pair made otherwise.
     """
-    how: dict[str, Any] = {"dem": dem, "altitude": altitude, "geoid": geoid, "resolution_of": resolution_of}
+    raw: dict[str, Any] = {"left_model": left_model, "right_model": right_model, "dem": dem, "altitude": altitude}
+    raw |= {"geoid": geoid, "resolution_of": resolution_of, "compares_rows": compares_rows, "overwrite": overwrite}
     images = [one if isinstance(one, Image) else open_image(one) for one in (left, right)]
-    how |= {"compares_rows": compares_rows, "overwrite": overwrite}
     out = path_of(out)
     with Connection(load_config(config).cluster, out) as connection:
-        return rectified(images, out, (left_model, right_model), pool_of(connection, out, progress), **how)
+        return rectified(images, out, pool_of(connection, out, progress), **raw)
 
 
 def rectified(
     images: Sequence[Image],
     out: Path,
-    models: Sequence[str | Path | None],
     pool: EachOnWorkers,
     *,
     compares_rows: bool = False,
@@ -95,7 +94,7 @@ def rectified(
 
     left, right = images
     dem, geoid, left_model, right_model = (
-        None if file is None else path_of(file) for file in (raw["dem"], raw["geoid"], *(models or (None, None)))
+        None if raw.get(name) is None else path_of(raw[name]) for name in ("dem", "geoid", "left_model", "right_model")
     )
     terrain = Terrain(dem, raw["altitude"], geoid)
     pair = RawPair(left, right, (left_model, right_model), terrain, raw["resolution_of"] or "coarser", raw.get("side"))

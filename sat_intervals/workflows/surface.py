@@ -1,6 +1,6 @@
 """Images to a surface model: of two an epipolar pair is matched and its points are gridded, more go by a sweep."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -130,8 +130,8 @@ def surface(
         return surface_of_many(opened, out, config, wanted, progress=progress, **how)
     check_absent({"extent": extent, "heights": heights}, "three images or more")
     check_cost(config)
-    cells = {"resolution": resolution, "crs": crs, "radius": radius, "geoid": geoid}
-    check_cells(cells, choices, resolved(config).interval)
+    cells: dict[str, Any] = {"resolution": resolution, "crs": crs, "radius": radius, "geoid": geoid, "choices": choices}
+    check_cells(resolved(config).interval, **cells)
     with compiled_beside(config), Connection(config.cluster, out) as connection:
         pool = pool_of(connection, out, progress)
         raw |= {"geoid": geoid if dem else None, "overwrite": overwrite}
@@ -146,14 +146,14 @@ def surface(
         check_sensors(pair.sensors, resolution, crs, choices)
         matching = EachOnWorkers(connection, progress)
         run = matched_on(matching, (pair.left, pair.right), out, config, window=window, **how)
-        made = surface_of(out, pair.sensors, pool, **cells, choices=choices)
+        made = surface_of(out, pair.sensors, pool, **cells)
     doubts = pair.record["warnings"] if pair.record else []
     warnings = [*doubts, *run["warnings"], *geometry_warnings(made["geometry"])]
     return {"rectify": pair.record, "run": run, "surface": made, "warnings": warnings}
 
 
-def check_cells(cells: Mapping[str, Any], choices: SurfaceChoices, interval: Interval | None) -> None:
-    """Raise for cells that the surface cannot have, before hours of matching."""
+def check_cells(interval: Interval | None, *, choices: SurfaceChoices, **cells: Any) -> None:
+    """Raise for cells that the surface cannot have, before hours of matching; see `surface_of`."""
     _, cell, _, radius = checked_cells(**cells)
     completion_of(cell, choices)
     surface_tags(["run"], [interval], choices.for_intervals([interval]), cell, radius)
@@ -190,15 +190,14 @@ def epipolar_pair(
         else rectified_files(left.path, right.path)
     )
     if files:
-        given = [name for name in ("dem", "altitude", "resolution_of") if raw.get(name) is not None]
-        if sensors and not has_grids(sensors):
-            given.append("a model without a grid")
-        if given:
-            raise SatIntervalsError(f"{given[0]} is for raw images, {left.path} is an epipolar image: leave it out")
+        of_raw = {name: raw[name] for name in ("dem", "altitude", "resolution_of")}
+        of_raw["a model without a grid"] = None if has_grids(sensors) else sensors or None
+        check_absent(of_raw, f"raw images, {left.path} is an epipolar image")
         return Epipolar(left, right, files, None)
     if window:
         raise SatIntervalsError("window is a region of an epipolar image: rectify these raw images, then match them")
-    record = rectified(images, out, sensors, pool, **raw)
+    raw |= dict(zip(("left_model", "right_model"), sensors or (None, None), strict=True))
+    record = rectified(images, out, pool, **raw)
     on_rectified(record)
     left, right = (open_image(out / name) for name in IMAGES)
     files = rectified_files(left.path, right.path)
