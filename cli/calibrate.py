@@ -35,8 +35,6 @@ from sat_intervals.cli.matching import SettingsArguments, unlevelled_options
 def calibrate(
     pairs: tuple[Path, ...],
     output: Path,
-    overwrite: bool,
-    name: str | None,
     surface: options.Surface | None,
     coverage: float | None,
     settings: SettingsArguments,
@@ -61,7 +59,7 @@ def calibrate(
     more: surface --height-calibration FILE.
     """
     if surface is not None:
-        calibrate_heights(surface, output, name, coverage, printing, overwrite=overwrite)
+        calibrate_heights(surface, output, how["name"], coverage, printing, overwrite=how["overwrite"])
         return
     if not pairs:
         raise click.UsageError("give PAIRS, or --dsm and --reference.")
@@ -70,14 +68,7 @@ def calibrate(
 
     with printing.console() as console:
         calibration, expected = calibrate(
-            pairs,
-            output,
-            settings.file,
-            overrides=settings.sections,
-            name=name,
-            overwrite=overwrite,
-            progress=console.progress,
-            **how,
+            pairs, output, settings.file, overrides=settings.sections, progress=console.progress, **how
         )
     printing.say({"calibration": calibration.model_dump(mode="json"), "expected": expected})
     if not printing.is_silent:

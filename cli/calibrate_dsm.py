@@ -31,13 +31,7 @@ def calibrate_heights(
     files = surface.dsm, surface.reference
     check_not_replaced(files, [output])
     check_output(output, overwrite=overwrite)
-    calibration = calibrate_surface(
-        *files,
-        name or output.stem,
-        coverage=coverage,
-        registers=surface.registers,
-        reference_sigma=surface.sigma,
-    )
+    calibration = calibrate_surface(*files, name or output.stem, coverage=coverage, **surface.how)
     write_commented(output, _HEIGHTS, calibration.model_dump(mode="json"))
     printing.say(calibration.model_dump(mode="json"))
     if not printing.is_silent:

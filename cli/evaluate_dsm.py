@@ -90,15 +90,8 @@ def evaluate_heights(surface: Surface, details: Details, printing: Printing) -> 
 
     if details.pictures:
         details.check_folder(details.pictures, surface)
-    within = {} if details.within is None else {"within": details.within}
-    report = evaluate_surface(
-        surface.dsm,
-        surface.reference,
-        details.classes,
-        registers=surface.registers,
-        reference_sigma=surface.sigma,
-        **within,
-    )
+    within: dict[str, Any] = {} if details.within is None else {"within": details.within}
+    report = evaluate_surface(surface.dsm, surface.reference, details.classes, **surface.how, **within)
     printing.say(report)
     if not printing.as_json:
         show_surface(str(surface.dsm), report)

@@ -156,12 +156,11 @@ def note_geometry(outs: Sequence[Path], sensor_files: Sequence[SensorFiles]) -> 
 
 @dataclass(frozen=True)
 class Surface:
-    """A surface model, reference heights to compare it with, whether these are moved to it first, and their sigma."""
+    """A surface model, reference heights to compare it with, and ``how``, further arguments of `evaluate_surface`."""
 
     dsm: Path
     reference: Path
-    registers: bool
-    sigma: float | None
+    how: dict[str, Any]
 
 
 # Options of commands for surface models and others that apply to both.
@@ -181,7 +180,8 @@ def surface_options(dsm_help: str, others: str, *of_surfaces: str) -> Decorator:
         if reference_sigma is not None and not dsm:
             raise click.UsageError("--reference-sigma goes with --dsm: leave it out.")
         _check_options(bool(dsm), others, of_surfaces)
-        return Surface(dsm, reference, not no_register, reference_sigma) if dsm and reference else None
+        how = {"registers": not no_register, "reference_sigma": reference_sigma}
+        return Surface(dsm, reference, how) if dsm and reference else None
 
     return gathered(
         "surface",
