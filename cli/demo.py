@@ -1,18 +1,12 @@
 """``sat-intervals demo``: match a procedural scene with exact truth."""
 
-from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from sat_intervals.cli.matching import RunArguments, SettingsArguments, run_options, settings_options
 from sat_intervals.cli.options import FILE, Grouped
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from sat_intervals.raster import Georeferencing
 
 
 @click.command(cls=Grouped, short_help="Make a scene with exact truth, match it and compare.")
@@ -64,16 +58,17 @@ def demo(
     from sat_intervals.demo import PIXEL, make_scene
     from sat_intervals.evaluate.disparity import evaluate_run
     from sat_intervals.raster import north_up
+    from sat_intervals.workflows.demo import CRS, LEFT, TOP, write_once
 
     layers = [out / f"{name}.tif" for name in ("left", "right", "truth")]
-    somewhere, nodata = north_up(32631, x=370_000, y=4_830_000, pixel=PIXEL), (0, 0, float("nan"))
+    somewhere, nodata = north_up(CRS, LEFT, TOP, PIXEL), (0, 0, float("nan"))
     with run.console() as console:
         console.progress("scene", 0, 1)
         scene = make_scene(*size, seed=seed, relief=relief)
         config = settings.load(disparity={"minimum": scene.minimum, "maximum": scene.maximum})
         settings.check_kept(out, *layers)
         for path, pixels, value in zip(layers, (scene.left, scene.right, scene.truth), nodata, strict=True):
-            _write(path, pixels, value, somewhere, overwrite=run.overwrite)
+            write_once(path, pixels, value, somewhere, overwrite=run.overwrite)
         console.progress("scene", 1, 1)
         report = run.match(out / "left.tif", out / "right.tif", out, config, progress=console.progress)
     figures = evaluate_run(out, out / "truth.tif")["all"]
@@ -114,20 +109,3 @@ def _demo_of_many(
             f"surface is moved onto the truth; NMAD of height - truth {figures['nmad']:.2f} m."
         )
     run.check_strict(report["warnings"])
-
-
-def _write(path: Path, pixels: "np.ndarray", nodata: float, place: "Georeferencing", *, overwrite: bool) -> None:
-    """Write a layer of the scene, unless the file has it already: a rerun resumes."""
-    import numpy as np
-
-    from sat_intervals.errors import InputError
-    from sat_intervals.raster import read_layers, write_layer
-    from sat_intervals.raster.publishing import check_free
-
-    if path.is_file():
-        with suppress(InputError):
-            if np.array_equal(read_layers(path), pixels[np.newaxis], equal_nan=pixels.dtype.kind == "f"):
-                return
-    check_free(path, overwrite=overwrite)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_layer(path, pixels, nodata, place, {"SOFTWARE": "sat-intervals"})

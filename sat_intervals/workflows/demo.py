@@ -59,16 +59,15 @@ def write_views(
     longitude, latitude = Projection(CRS).degrees(LEFT + PIXEL * (column + 0.5), TOP - PIXEL * (row + 0.5))
     ground = np.stack([longitude, latitude, height], axis=1)
     paths = [folder / f"{number}.tif" for number in range(1, count + 1)]
-    folder.mkdir(parents=True, exist_ok=True)
     for path, pixels, slant, error in zip(paths, images, slants, errors, strict=True):
         places = np.stack([row, column + slant * (height - DATUM)], axis=1) + error
-        _write(path, pixels, 0, Georeferencing(), overwrite=overwrite, rpcs=fitted_rpc(ground, places))
+        write_once(path, pixels, 0, Georeferencing(), overwrite=overwrite, rpcs=fitted_rpc(ground, places))
     truth = folder / "truth.tif"
-    _write(truth, heights, float("nan"), north_up(CRS, LEFT, TOP, PIXEL), overwrite=overwrite)
+    write_once(truth, heights, float("nan"), north_up(CRS, LEFT, TOP, PIXEL), overwrite=overwrite)
     return paths, truth
 
 
-def _write(
+def write_once(
     path: Path, pixels: np.ndarray, nodata: float, place: Georeferencing, *, overwrite: bool, **options: Any
 ) -> None:
     """Write a layer, unless the file has it already: a rerun resumes."""
@@ -77,4 +76,5 @@ def _write(
             if np.array_equal(read_layers(path), pixels[np.newaxis], equal_nan=pixels.dtype.kind == "f"):
                 return
     check_free(path, overwrite=overwrite)
+    path.parent.mkdir(parents=True, exist_ok=True)
     write_layer(path, pixels, nodata, place, _TAGS, **options)
