@@ -107,38 +107,46 @@ class Console:
 
     def summary(self, report: dict[str, Any], out: Path, then: str | None = None) -> None:
         """Print the table at the end of a run, its verdict, its warnings, its files, and the next command, if any."""
-        counts = report["counts"]
-        table = Table(show_header=False, box=None, pad_edge=False)
-        table.add_column(style="bold")
-        table.add_column(justify="right")
-        pixels = counts["pixels"]
+        counts, rows = report["counts"], dict[str, str]()
         if report.get("search") and report["requested"]["disparity"]["minimum"] == "auto":
-            table.add_row("search range, found", f"{report['search']['minimum']} to {report['search']['maximum']} px")
+            rows["search range, found"] = f"{report['search']['minimum']} to {report['search']['maximum']} px"
         if report.get("local_ranges"):
-            table.add_row("local ranges, of the whole", f"{100 * report['local_ranges']['share']:.0f} %")
-        table.add_row("valid pixels", _share(counts["valid"], pixels))
+            rows["local ranges, of the whole"] = f"{100 * report['local_ranges']['share']:.0f} %"
+        rows["valid pixels"] = _share(counts["valid"], counts["pixels"])
         for flag, count in counts["causes"].items():
             if count:
-                table.add_row(f"  {_CAUSES.get(flag, flag.replace('_', ' '))}", _share(count, pixels))
+                rows[f"  {_CAUSES.get(flag, flag.replace('_', ' '))}"] = _share(count, counts["pixels"])
         width = counts["median_interval_width"]
-        table.add_row("median interval width", "none" if width is None else f"{width:.2f} px")
-        table.add_row("low confidence, of valid pixels", _share(counts["low_confidence"], counts["valid"]))
+        rows["median interval width"] = "none" if width is None else f"{width:.2f} px"
+        rows["low confidence, of valid pixels"] = _share(counts["low_confidence"], counts["valid"])
         if any((given := counts["agreement"]).values()):
-            table.add_row("given disparities inside", _share(given["inside"], sum(given.values())))
+            rows["given disparities inside"] = _share(given["inside"], sum(given.values()))
         if report.get("rows"):
             of_rows = report["survey"]["rows"]
             moved = f"up to {of_rows['most']:.2f} px, {of_rows['after'][0]:.2f} px left"
-            table.add_row("rows of the right image moved", moved)
-        table.add_row("time", f"{report['seconds']['total']:.1f} s")
-        self._terminal.print(table)
+            rows["rows of the right image moved"] = moved
+        self._say_rows(rows, report)
         self.say(report["verdict"])
-        warn(report["warnings"])
-        for name in ("intervals.tif", "validity.tif", "run.json"):
-            self.say(str(out / name))
+        self._say_files(report, out, "intervals.tif")
         if old := [name for name in _MADE_FROM_RUNS if _is_older(out / name, out / "run.json")]:
             self.say(f"of an earlier run: {', '.join(old)}: make them again")
         if then:
             self.say(f"next: sat-intervals {then} {quote(str(out))}")
+
+    def _say_rows(self, rows: dict[str, str], report: dict[str, Any]) -> None:
+        """Print what a run found, and its time."""
+        table = Table(show_header=False, box=None, pad_edge=False)
+        table.add_column(style="bold")
+        table.add_column(justify="right")
+        for row in (*rows.items(), ("time", f"{report['seconds']['total']:.1f} s")):
+            table.add_row(*row)
+        self._terminal.print(table)
+
+    def _say_files(self, report: dict[str, Any], out: Path, name: str) -> None:
+        """Print the warnings of a run and the names of its files."""
+        warn(report["warnings"])
+        for file in (name, "validity.tif", "run.json"):
+            self.say(str(out / file))
 
     def say_images(self, swept: dict[str, Any]) -> None:
         """Print the shifts and likeness of the images of a sweep."""
@@ -153,21 +161,12 @@ class Console:
         """Print the table at the end of a sweep of many images, its shifts and warnings."""
         counts, swept = report["counts"], report["sweep"]
         self.say_images(swept)
-        table = Table(show_header=False, box=None, pad_edge=False)
-        table.add_column(style="bold")
-        table.add_column(justify="right")
-        for row in lines_of_grid(swept).items():
-            table.add_row(*row)
-        seen = counts["pixels"] - counts["causes"]["left_window"]
-        table.add_row("height, of cells that two images see", _share(counts["valid"], seen))
-        width = counts["median_interval_width"]
-        table.add_row("median half width", "none" if width is None else f"+-{width * swept['step'] / 2:.2f} m")
-        table.add_row("time", f"{report['seconds']['total']:.1f} s")
-        self._terminal.print(table)
+        seen, width = counts["pixels"] - counts["causes"]["left_window"], counts["median_interval_width"]
+        rows = lines_of_grid(swept) | {"height, of cells that two images see": _share(counts["valid"], seen)}
+        rows["median half width"] = "none" if width is None else f"+-{width * swept['step'] / 2:.2f} m"
+        self._say_rows(rows, report)
         say_completed(self, swept.get("completed"))
-        warn(report["warnings"])
-        for name in ("dsm.tif", "validity.tif", "run.json"):
-            self.say(str(out / name))
+        self._say_files(report, out, "dsm.tif")
 
     def batch_summary(self, report: dict[str, dict[str, Any]]) -> None:
         """Print the table at the end of a batch: the state of each pair, and its surface if any pair has one."""
