@@ -4,6 +4,7 @@ import logging
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from itertools import product
 from pathlib import Path
 from typing import IO
 
@@ -57,22 +58,17 @@ def logged(debug: bool, log_file: Path | None) -> Iterator[None]:
         # Libraries give the root logger handlers of their own, which would repeat our lines.
         stack.callback(setattr, ours, "propagate", ours.propagate)
         ours.propagate = False
+        shown = _Handler(_LINES if debug else _Warnings())
+        shown.setLevel(logging.NOTSET if debug else logging.WARNING)
+        shown.addFilter(lambda record: record.name != REPORT)
         everything = [_Handler(_LINES, stack.enter_context(_opened(log_file)))] if log_file else []
-        if debug:
-            everything.append(_Handler(_LINES))
-            everything[-1].addFilter(_is_of_no_report)
-        else:
-            warnings = _Handler(_Warnings())
-            warnings.setLevel(logging.WARNING)
-            warnings.addFilter(_is_of_no_report)
-            stack.enter_context(_added(warnings, ours))
+        everything += [shown] if debug else []
         # dask's logger gets a handler of its own and does not propagate, unless the root logger already has handlers
         dasks = logging.getLogger("distributed")
-        for handler in everything:
-            stack.enter_context(_added(handler, logging.root))
-            stack.enter_context(_added(handler, ours))
-            if not dasks.propagate:
-                stack.enter_context(_added(handler, dasks))
+        loggers = [logging.root, ours, *([] if dasks.propagate else [dasks])]
+        for handler, logger in [*product(everything, loggers), *([] if debug else [(shown, ours)])]:
+            logger.addHandler(handler)
+            stack.callback(logger.removeHandler, handler)
         # what aiohttp leaves to asyncio of a lost connection is raised, too
         logger, level = (ours, logging.DEBUG) if everything else (logging.getLogger("asyncio"), logging.CRITICAL)
         stack.callback(logger.setLevel, logger.level)
@@ -90,19 +86,6 @@ def logged(debug: bool, log_file: Path | None) -> Iterator[None]:
             _LOG.debug("%s failed", name, exc_info=error)
             raise
         _LOG.info("%s ended after %.1f s", name, time.monotonic() - began)
-
-
-def _is_of_no_report(record: logging.LogRecord) -> bool:
-    return record.name != REPORT
-
-
-@contextmanager
-def _added(handler: logging.Handler, logger: logging.Logger) -> Iterator[None]:
-    logger.addHandler(handler)
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)
 
 
 @contextmanager
