@@ -55,6 +55,7 @@ def plot(
     Of three images and more, only dsm.png and ortho.png are drawn. Rows and columns count from 0 at the first pixel of
     OUT/intervals.tif. Needs the extra [plot].
     """  # noqa: D301 (\b keeps the line breaks in click)
+    from sat_intervals.errors import check_absent
     from sat_intervals.results import open_results, read_change
     from sat_intervals.show.accuracy import draw_coverage
     from sat_intervals.show.change_map import draw_change
@@ -62,14 +63,14 @@ def plot(
     from sat_intervals.show.preparation import draw_range, draw_rows, has_range, has_rows
     from sat_intervals.show.profile import draw_curve, draw_profile
 
-    of_pair = {"row": row, "columns": columns, "pixel": pixel, "beside": beside or None}
+    of_pair = {"--row": row, "--columns": columns, "--pixel": pixel, "--beside": beside or None}
     if changed := read_change(out):
-        _refuse(of_pair | {"truth": truth}, f"{out} is a change between two dates")
+        check_absent(of_pair | {"--truth": truth}, f"a pair, {out} is a change between two dates")
         return _draw(out, {"change": partial(draw_change, out / "change.tif", changed, dpi=dpi)})
     results = open_results(out, truth)
     of_surface = _of_surface(results, dpi)
     if results.is_sweep:
-        _refuse(of_pair, f"{out} is of {len(results.images)} images")
+        check_absent(of_pair, f"a pair, {out} is of {len(results.images)} images")
         results.check_kept([out / f"{name}.png" for name in of_surface])
         return _draw(out, of_surface)
     is_judged = results.truth is not None and results.config.interval is not None
@@ -120,11 +121,3 @@ def _check_options(
     check_one_pair([results.out, *beside])
     if columns is not None and row is None:
         raise SatIntervalsError(f"--columns {columns[0]} {columns[1]} belong to a profile: give --row too")
-
-
-def _refuse(of_pair: dict[str, Any], what: str) -> None:
-    """Raise if an option is given that only a pair has."""
-    from sat_intervals.errors import SatIntervalsError
-
-    if given := [name for name, value in of_pair.items() if value is not None]:
-        raise SatIntervalsError(f"--{given[0]} is for a pair, {what}: leave it out")
