@@ -65,20 +65,16 @@ class Accuracy:
 
     def __init__(self, nominal: float | None, within: float, *, is_noisy: bool = False) -> None:
         self._nominal, self._within, self._is_noisy = nominal, within, is_noisy
-        self._count = self._missing = self._near = 0
+        self._sums = np.zeros(5)  # heights, missing ones, near ones, errors, their squares
         self._blocks = np.zeros((2, BLOCKS**2))  # intervals, and those that contain their reference
-        self._sum = self._squares = 0.0
         self._noisy: list[Heights] = []
         self._errors, self._intervals = Histogram(-LARGEST, LARGEST, 1000), Intervals(LARGEST, nominal)
 
     def add(self, cells: Heights, missing: int) -> None:
         """Add cells, and a number of reference heights whose cells have no height."""
         error = cells.height - cells.reference
-        self._count += error.size
-        self._missing += missing
-        self._near += int((np.abs(error) <= self._within).sum())
-        self._sum += float(error.sum())
-        self._squares += float(np.square(error).sum())
+        near = np.abs(error) <= self._within
+        self._sums += error.size, missing, near.sum(), error.sum(), np.square(error).sum()
         self._errors.add(error)
         bounded = cells.of(np.isfinite(cells.half_width))
         self._intervals.add(np.maximum(bounded.outside, 0), 2 * bounded.half_width)
@@ -90,7 +86,7 @@ class Accuracy:
     def report(self) -> dict[str, Any]:
         """Return all figures, None without cells: metres, and shares of cells with an interval."""
         deviation, low, high = self._errors.deviation(), self._errors.quantile(0.05), self._errors.quantile(0.95)
-        intervals = self._intervals.report()
+        intervals, (count, missing, near, total, squares) = self._intervals.report(), self._sums.tolist()
         coverage, of_coverage = intervals["accuracy"], coverage_deviation(*self._blocks)
         if self._noisy:
             coverage, of_coverage = coverage_of(Heights(*map(np.concatenate, zip(*self._noisy, strict=True))))
@@ -98,13 +94,13 @@ class Accuracy:
             name: None if (width := intervals[f"{name}_width"]) is None else width / 2 for name in ("mean", "median")
         }
         return {
-            "count": self._count,
-            "completeness": share(self._count, self._count + self._missing),
-            "within": share(self._near, self._count + self._missing),
-            "bias": share(self._sum, self._count),
+            "count": int(count),
+            "completeness": share(count, count + missing),
+            "within": share(near, count + missing),
+            "bias": share(total, count),
             "median": self._errors.median(),
             "nmad": None if deviation is None else _NORMAL * deviation,
-            "rmse": float(np.sqrt(self._squares / self._count)) if self._count else None,
+            "rmse": float(np.sqrt(squares / count)) if count else None,
             "le90": self._errors.quantile_of_absolutes(0.9),
             "p95_p5": None if low is None or high is None else high - low,
             "with_interval": intervals["count"],

@@ -42,27 +42,23 @@ class Intervals:
 
     def __init__(self, widest: int, nominal: float | None) -> None:
         self._of_misses = None if nominal is None or nominal >= 1 else 2 / (1 - nominal)
-        self._count = self._inside = 0
-        self._width = self._missed = 0.0
+        self._sums = np.zeros(4)  # intervals, those that contain the truth, widths, distances of missed truths
         self._widths = Histogram(0, widest, _WIDTH)
 
     def add(self, missed: np.ndarray, width: np.ndarray) -> None:
         """Add intervals, with the distance of a missed truth from each; 0 if it is inside."""
-        self._count += missed.size
-        self._inside += int((missed == 0).sum())
-        self._missed += float(missed.sum())
-        self._width += float(width.sum())
+        self._sums += missed.size, (missed == 0).sum(), width.sum(), missed.sum()
         self._widths.add(width)
 
     def report(self) -> dict[str, Any]:
         """Return all figures, None without intervals."""
-        weight = self._of_misses
+        weight, (count, inside, widths, missed) = self._of_misses, self._sums.tolist()
         return {
-            "count": self._count,
-            "accuracy": share(self._inside, self._count),
-            "mean_width": share(self._width, self._count),
+            "count": int(count),
+            "accuracy": share(inside, count),
+            "mean_width": share(widths, count),
             "median_width": self._widths.median(),
-            "interval_score": None if weight is None else share(self._width + weight * self._missed, self._count),
+            "interval_score": None if weight is None else share(widths + weight * missed, count),
         }
 
 
@@ -100,20 +96,16 @@ class _Locking:
     """How much more often disparities are near whole pixels than truths: 0 alike, 1 whole pixels only."""
 
     def __init__(self) -> None:
-        self._count = 0
-        self._disparity = 0.0
-        self._truth = 0.0
+        self._sums = np.zeros(3)
 
     def add(self, disparity: np.ndarray, truth: np.ndarray) -> None:
         near = np.abs(disparity - truth) <= 1
-        self._count += int(near.sum())
-        self._disparity += float(np.cos(2 * np.pi * disparity[near]).sum())
-        self._truth += float(np.cos(2 * np.pi * truth[near]).sum())
+        self._sums += near.sum(), *(np.cos(2 * np.pi * values[near]).sum() for values in (disparity, truth))
 
     def report(self) -> float | None:
         """Return the difference of the mean cosines of the fractions; None if all truths are whole."""
-        known = self._count and self._truth < self._count
-        return (self._disparity - self._truth) / self._count if known else None
+        count, of_disparity, of_truth = self._sums.tolist()
+        return (of_disparity - of_truth) / count if of_truth < count else None
 
 
 class Metrics:
