@@ -8,7 +8,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from sat_intervals.evaluate.paper import ACCURACY, OBJECTIVE, TABLE_1, SceneMetrics, look_up, table_1
+from sat_intervals.evaluate.paper import ACCURACY, OBJECTIVE, TABLE_1, SceneMetrics, look_up, mean, table_1
 
 if TYPE_CHECKING:
     from sat_intervals.config import Calibration
@@ -52,8 +52,7 @@ def show_scenes(scenes: Sequence[SceneMetrics]) -> None:
         ("all", "median_width"), ("all", "interval_score"), ("median_error",),
     ]  # fmt: skip
     figures = {scene.name: [look_up(scene.report, path) for path in paths] for scene in scenes}
-    known = [[value for value in column if value is not None] for column in zip(*figures.values(), strict=True)]
-    figures["mean"] = [sum(column) / len(column) if column else None for column in known]
+    figures["mean"] = [mean(column) for column in zip(*figures.values(), strict=True)]
     nominal = " or ".join(sorted({_NOMINAL[scene.report["nominal_is"]] for scene in scenes}, reverse=True))
     header = ["", nominal, "coverage", "high", "low", "mean width", "median width", "score", "median error"]
     rows = [[name, *map(_figure, values)] for name, values in figures.items()]

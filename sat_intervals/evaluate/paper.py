@@ -56,12 +56,13 @@ def table_1(scenes: Iterable[SceneMetrics]) -> list[Row]:
     rows = []
     for group, cost in sorted(groups, key=lambda key: places.index(key[0])):
         reports = groups[group, cost]
-        means = {name: _mean([look_up(report, place) for report in reports]) for name, place in TABLE_1.items()}
+        means = {name: mean(look_up(report, place) for report in reports) for name, place in TABLE_1.items()}
         reached = sum((look_up(report, ACCURACY) or 0.0) >= OBJECTIVE for report in reports)
         rows.append(Row(f"{group} {cost}" if several else group, means, len(reports), reached))
     return rows
 
 
-def _mean(figures: list[float | None]) -> float | None:
+def mean(figures: Iterable[float | None]) -> float | None:
+    """Return the mean of those that are known."""
     known = [figure for figure in figures if figure is not None]
     return sum(known) / len(known) if known else None

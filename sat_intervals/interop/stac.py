@@ -101,8 +101,7 @@ def _item(run: Run, times: dict[str, str | None], identifier: str) -> dict[str, 
         "assets": assets,
     }
     if corners:
-        around = [[round(value, _DIGITS) for value in corner] for corner in corners]
-        item |= _place(around)
+        item |= _place([[round(value, _DIGITS) for value in corner] for corner in corners])
     return item
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Any
 
 import numpy as np
 
@@ -165,12 +166,8 @@ def _on_grid(stack: Stack, cells: Cells, grid: Cells) -> Stack:
     inner = [-(-size // BLOCK) for size in stack.ground.shape]
     around = [(one, -(-whole // BLOCK) - one - size) for one, whole, size in zip(first, shape, inner, strict=True)]
     search, ranges = stack.config.disparity, stack.ranges
-    ends = (
-        (ranges.minimum, ranges.maximum)
-        if ranges
-        else (np.full(inner, end) for end in (search.minimum, search.maximum))
-    )
-    least, most = (np.pad(end, around).astype(np.int16) for end in ends)
+    ends: list[Any] = [ranges.minimum, ranges.maximum] if ranges else [search.minimum, search.maximum]
+    least, most = (np.pad(np.broadcast_to(end, inner), around).astype(np.int16) for end in ends)
     ground = replace(stack.ground, first=first, shape=shape)
     return replace(stack, ground=ground, ranges=LocalRanges(least, most, BLOCK, BLOCK))
 

@@ -26,16 +26,13 @@ def write_report(results: Results) -> Path:
 
 
 def _page(contents: Mapping[str, Any]) -> str:
-    # A "<" in the contents could end the script element.
-    data = json.dumps(contents, separators=(",", ":")).replace("<", "\\u003c")
-    script = "".join(map(_asset, ("draw.js", "explore.js", "tables.js")))
-    title = f"{contents['quantity']['name'].capitalize()} intervals"
     parts = {
-        "title": title,
+        "title": f"{contents['quantity']['name'].capitalize()} intervals",
         "summary": _summary(contents),
         "style": _asset("report.css"),
-        "script": script,
-        "contents": data,
+        "script": "".join(map(_asset, ("draw.js", "explore.js", "tables.js"))),
+        # A "<" in the contents could end the script element.
+        "contents": json.dumps(contents, separators=(",", ":")).replace("<", "\\u003c"),
     }
     return re.sub(rf"/\* ({'|'.join(parts)}) \*/", lambda found: parts[found[1]], _asset("report.html"))
 
