@@ -22,7 +22,7 @@ from sat_intervals.config import Cluster
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.machine import usable_cores
 from sat_intervals.run.batch_system import batch_system
-from sat_intervals.run.workers import CHECK_EVERY, Outcome, Task, in_flight, readers, reason
+from sat_intervals.run.workers import CHECK_EVERY, Outcome, Task, called, in_flight, readers, reason
 
 STARTING = 120.0  # seconds for local worker processes to start
 DASK = {
@@ -97,7 +97,9 @@ class DaskWorkers:
     def _submit(self, task: Task) -> Future[Outcome]:
         key = f"{task.function.__name__}-{self._run}-{next(self._numbers)}"
         with _scheduler_errors():
-            future = self._client.submit(task.function, *task.arguments, key=key, retries=task.retries, pure=False)
+            future = self._client.submit(
+                called, task.function, *task.arguments, key=key, retries=task.retries, pure=False
+            )
         loop: Any = self._client.loop
         return asyncio.run_coroutine_threadsafe(_outcome(task.label, future), loop.asyncio_loop)
 

@@ -17,7 +17,7 @@ from sat_intervals.products import NO_DISPARITY
 from sat_intervals.progress import timed
 from sat_intervals.run.job import Job
 from sat_intervals.run.source import Source, costed, frame_of, read_source
-from sat_intervals.run.workers import computing, picklable_errors
+from sat_intervals.run.workers import computing
 from sat_intervals.store.arrays import numbered
 from sat_intervals.store.tiles import BORDERS
 from sat_intervals.tiling import Tile
@@ -30,7 +30,7 @@ _LOG = logging.getLogger(__name__)
 
 def match_block(job: Job, block: Tile) -> None:
     """Match the tiles of a block and write their intermediate products; runs on a worker."""
-    with _logged_failure(job, block.name), picklable_errors():
+    with _logged_failure(job, block.name):
         read: dict[str, float] = {}
         tiles, ranges = job.store.grid.within(block.core), job.ranges()
         source = read_source(job, block, ranges, read)
@@ -50,7 +50,7 @@ def match_block(job: Job, block: Tile) -> None:
 
 def trace_block(job: Job, block: Tile, wavefront: int) -> dict[str, float]:
     """Write the path states that a block hands on in a wavefront; return seconds by stage; runs on a worker."""
-    with _logged_failure(job, f"{block.name}, wavefront {wavefront},"), picklable_errors():
+    with _logged_failure(job, f"{block.name}, wavefront {wavefront},"):
         return _trace_block(job, block, wavefront)
 
 

@@ -4,7 +4,7 @@ import errno
 import logging
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import cache
 from queue import Empty, SimpleQueue
@@ -138,7 +138,7 @@ def _tried(task: Task) -> Outcome:
     tries = 0
     while True:
         try:
-            return Outcome(task.label, task.function(*task.arguments), None)
+            return Outcome(task.label, called(task.function, *task.arguments), None)
         except Exception as error:
             tries += 1
             if tries > task.retries:
@@ -174,11 +174,10 @@ def check_not_full(error: BaseException, place: object) -> None:
         ) from error
 
 
-@contextmanager
-def picklable_errors() -> Iterator[None]:
-    """Drop the causes of our errors: those of GDAL cannot be sent from a worker."""
+def called(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call the function of a task; drop the causes of our errors: those of GDAL cannot be sent from a worker."""
     try:
-        yield
+        return function(*arguments)
     except SatIntervalsError as error:
         error.__cause__ = error.__context__ = None
         raise

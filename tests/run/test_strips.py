@@ -100,10 +100,10 @@ def test_finish_strips__gives_the_same_bytes_for_all_workers_and_tiles(tall, tmp
 def test_finish_strips__goes_on_from_the_parts_that_are_done(tall, tmp_path, monkeypatch):
     out = with_tiles(tall, tmp_path / "out")
 
-    def fail(job, of, place, *rest):
-        if place == (0, 2):
+    def fail(job, strip, scale):
+        if strip.row == 2 * BLOCK:
             raise OSError("disk gone")
-        return finish(job, of, place, *rest)
+        return finish(job, strip, scale)
 
     finish = strips.finish_strip
     with monkeypatch.context() as patch:
@@ -151,10 +151,10 @@ def test_finish_strips__with_zstd(tall, tmp_path):
             assert file.tags() == kept.tags()
 
 
-def test_finish_strip__refuses_a_worker_with_other_codecs(tall, tmp_path, monkeypatch):
+def test_make_part__refuses_a_worker_with_other_codecs(tall, tmp_path, monkeypatch):
     out = with_tiles(tall, tmp_path / "out")
-    finish = strips.finish_strip
-    monkeypatch.setattr(strips, "finish_strip", lambda job, parts, *rest: finish(job, replace(parts, codecs={}), *rest))
+    make = parts_of_files.make_part
+    monkeypatch.setattr(parts_of_files, "make_part", lambda parts, *rest: make(replace(parts, codecs={}), *rest))
     with pytest.raises(RunError, match=r"this worker compresses with .*'gdal'.*install the same versions of"):
         matched(tall, out)
     assert not parts(out)
@@ -255,8 +255,10 @@ def test_status__counts_strips(tall, tmp_path, monkeypatch):
     out = with_tiles(tall, tmp_path / "out")
     finish = strips.finish_strip
 
-    def first_only(job, codecs, key, *rest):
-        return finish(job, codecs, key, *rest) if key == (0, 0) else "not made"
+    def first_only(job, strip, scale):
+        if strip.row:
+            raise DamagedTilesError("not made")
+        return finish(job, strip, scale)
 
     monkeypatch.setattr(strips, "finish_strip", first_only)
     with pytest.raises(DamagedTilesError):
