@@ -26,11 +26,10 @@ class Stream:
     Rows that wait for a full row of blocks are in a file too, so that memory does not grow with the width.
     """
 
-    def __init__(self, file: File, folder: Path, shape: tuple[int, int], threads: int | None) -> None:
+    def __init__(self, file: File, folder: Path, shape: tuple[int, int]) -> None:
         """``folder``: where temporary files without names are made."""
         self._file = file
         self._folder = folder
-        self._threads = threads
         self._shapes = [(-(-shape[0] // factor), -(-shape[1] // factor)) for factor in factors(*shape)]
         self._rows = [0 for _ in self._shapes]
         with ExitStack() as files:
@@ -68,7 +67,7 @@ class Stream:
         columns = (rows[:, :, first : first + step] for first in range(0, rows.shape[2], step))
         out = self._strips[level]
         start, sizes = out.tell(), list[int]()
-        with ThreadPoolExecutor(self._threads or usable_cores()) as pool:
+        with ThreadPoolExecutor(usable_cores()) as pool:
             for blocks in pool.map(partial(compressed, file=self._file), columns):
                 out.write(blocks.content)
                 sizes += blocks.sizes

@@ -204,7 +204,7 @@ def copy_parts(
                 [Part(metas[level, row]["blocks"][file.name], ((level, row), file.name)) for row in range(count)]
                 for level, count in enumerate(parts.rows)
             ]
-            writer.assemble(file.name, levels, partial(copy, writer.folder / file.name))
+            writer.assemble(file, levels, partial(copy, writer.folder / file.name))
     if damaged := sorted({name for name in copied if name}):
         raise parts.store.damaged(PARTS, damaged, parts.of)
 

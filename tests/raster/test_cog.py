@@ -138,7 +138,7 @@ def test_assemble__has_the_tags_of_gdals_own_driver(tmp_path):
 @pytest.mark.parametrize("rows", [100, 512, 1100])
 def test_stream__makes_the_parts_of_any_strips(tmp_path, rows):
     bands = noise(INTERVALS, 1100, 40)
-    stream = Stream(INTERVALS, tmp_path, bands.shape[1:], 2)
+    stream = Stream(INTERVALS, tmp_path, bands.shape[1:])
     for row in range(0, 1100, rows):
         stream.write(row, bands[:, row : row + rows])
     expected = parts_of(bands, INTERVALS)
