@@ -318,21 +318,13 @@ def _identity(ground: GroundViews) -> dict[str, Any]:
 def _manifest(prepared: Prepared[FilePair], inputs: Mapping[str, Any], region: Window) -> dict[str, Any]:
     """Return all that decides the bytes of a tile; of a calibration only its levels."""
     config = prepared.config
-    ranges = prepared.ranges
-    rows = prepared.rows
     settings = config.model_dump(mode="json", exclude=_NOT_OF_TILES)
-    levels = config.cuts
-    if levels is not None:
-        settings["interval"] = {
-            "high": levels.high,
-            "edge": levels.edge,
-            "low": levels.low,
-            "steps": config.bound_steps,
-            "cut": config.fit_cut,
-        }
+    if levels := config.cuts:
+        cuts = {"high": levels.high, "edge": levels.edge, "low": levels.low}
+        settings["interval"] = cuts | {"steps": config.bound_steps, "cut": config.fit_cut}
     return {
-        **({"local_ranges": digest(ranges.report())} if ranges else {}),
-        **({"rows": asdict(rows)} if rows else {}),
+        **({"local_ranges": digest(prepared.ranges.report())} if prepared.ranges else {}),
+        **({"rows": asdict(prepared.rows)} if prepared.rows else {}),
         **({"ground": _identity(prepared.ground)} if prepared.ground else {}),
         **_made_by(),
         "settings": settings,
