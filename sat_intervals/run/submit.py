@@ -8,7 +8,7 @@ import time
 import uuid
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError, Future
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -148,14 +148,11 @@ def connected(settings: Cluster, out: Path) -> Iterator[Client]:
 @contextmanager
 def _silenced(names: Sequence[str]) -> Iterator[None]:
     """Keep lines of loggers away: after shareloc the root logger would print them."""
-    levels = {logging.getLogger(name): logging.getLogger(name).level for name in names}
-    try:
-        for logger in levels:
+    with ExitStack() as levels:
+        for logger in map(logging.getLogger, names):
+            levels.callback(logger.setLevel, logger.level)
             logger.setLevel(logging.CRITICAL)
         yield
-    finally:
-        for logger, level in levels.items():
-            logger.setLevel(level)
 
 
 def _ignore_interrupts() -> None:
