@@ -87,12 +87,12 @@ def _compressed(bands: np.ndarray, file: File) -> list[memoryview]:
     return [content[offset : offset + size] for offset, size in places]
 
 
-def tiled(file: File) -> dict[str, Any]:
+def tiled(file: File, side: int = BLOCK) -> dict[str, Any]:
     """Return the options of GDAL for the blocks of a file."""
     return {
         "tiled": True,
-        "blockxsize": BLOCK,
-        "blockysize": BLOCK,
+        "blockxsize": side,
+        "blockysize": side,
         "interleave": "band",
         "compress": file.compression,
         "predictor": _PREDICTORS[file.predictor],
