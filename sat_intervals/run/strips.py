@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.config import Config, HeightCalibration
+from sat_intervals.config import HeightCalibration
 from sat_intervals.kernels.conformal import AROUND, Margins, relief_of
 from sat_intervals.match.around import with_agreement
 from sat_intervals.match.ground import GroundViews
@@ -66,7 +66,7 @@ def finish_strip(job: Job, strip: Window, scale: ConfidenceScale) -> Rows:
     given = given_disparities(job.config, Window(region.row + strip.row, region.column, *shape))
     tally, row = Tally(search.count, search.minimum), 0
     counts = list[np.ndarray]()
-    finals = postprocess_strips(raw_rows(job, job.config, read.row, read.row_stop, counts), scale, job.config)
+    finals = postprocess_strips(raw_rows(job, read.row, read.row_stop, counts), scale, job.config)
     if job.swept and job.swept.calibration:
         finals = _widened(finals, job.swept.calibration, job.ground())
     for final in inner_rows(finals, strip.row - read.row, strip.height):
@@ -103,19 +103,17 @@ def _to_heights(bands: np.ndarray, count: np.ndarray, ground: GroundViews | None
         band[:] = ground.base + ground.step * band.astype(np.float64)
 
 
-def raw_rows(
-    job: Job, config: Config, first: int, last: int, counts: list[np.ndarray] | None = None
-) -> Iterator[RawRows]:
+def raw_rows(job: Job, first: int, last: int, counts: list[np.ndarray] | None = None) -> Iterator[RawRows]:
     """Yield raw products of the rows ``[first, last)`` of the region, with the pixels that the settings need.
 
     The images that see the cells of a sweep are appended to ``counts``.
     """
-    region, search = job.store.grid.region, config.disparity
+    region, config = job.store.grid.region, job.config
     if config.fits:
         window = Window(region.row + first, region.column, last - first, region.width)
         left, right = pixels_of(read_views((job.left, job.right), pixel_windows(window, config)))
     row = 0
-    for piece in job.store.strips(max(1, STRIP_PIXELS // region.width), search.count, first, last):
+    for piece in job.store.strips(max(1, STRIP_PIXELS // region.width), config.disparity.count, first, last):
         if (count := piece.pop("count", None)) is not None and counts is not None:
             counts.append(count)
         rows = RawRows(
