@@ -251,12 +251,10 @@ def job_of(
     read = [*identities(inputs), *(files_of(config.disparity.grid) if config.disparity.grid else ())]
     manifest = _manifest(prepared, relative_in(out, inputs), region)
     run = digest(manifest)
-    folder = folder_at(home_of(out))
-    if config.cluster.store:
-        folder = folder_at(f"{folder_at(config.cluster.store)}/{'-'.join(filter(None, (pair, run)))}")
-    manifest[PLACE] = None if folder == folder_at(home_of(out)) else str(folder)
+    store = config.cluster.store
+    manifest[PLACE] = f"{folder_at(store)}/{'-'.join(filter(None, (pair, run)))}" if store else None
     check_not_replaced(read, [out / name for name in outputs_of(config)], [home_of(out)])
-    kept = Store(folder, Grid(region, config.tiles.size), run)
+    kept = Store(place_of(home_of(out), manifest), Grid(region, config.tiles.size), run)
     return Job(prepared, kept, out, manifest, requested, overwrite, swept=swept)
 
 
