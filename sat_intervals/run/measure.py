@@ -23,6 +23,7 @@ from sat_intervals.prepare.prepared import Prepared, prepare
 from sat_intervals.products import INVALID
 from sat_intervals.progress import Progress
 from sat_intervals.raster import BLOCK, Image, Layer, open_image
+from sat_intervals.raster.images import check_size
 from sat_intervals.run.assemble import scale_of
 from sat_intervals.run.checks import checked_pair, checked_region
 from sat_intervals.run.connection import Connection
@@ -59,11 +60,7 @@ class CalibrationScene:
 def truth_of(left: Image, path: str | Path) -> Layer:
     """Open the truth of a whole left image; raise if it has another size."""
     truth = open_image(path)
-    if (truth.height, truth.width) != (left.height, left.width):
-        raise SatIntervalsError(
-            f"{truth.path} has {truth.height} x {truth.width} pixels, {left.path} {left.height} x {left.width}: "
-            "give the truth of the left image"
-        )
+    check_size(truth.path, (truth.height, truth.width), left, "give the truth of the left image")
     return Layer(truth, 0, 0)
 
 
