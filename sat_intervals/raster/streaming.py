@@ -45,12 +45,8 @@ class Stream:
             os.posix_fallocate(stream.fileno(), 0, int(np.prod(shape)) * np.dtype(self._file.dtype).itemsize)
             return np.memmap(stream, self._file.dtype, "r+", shape=shape)
 
-    def write(self, row: int, bands: np.ndarray) -> None:
-        """Write ``(bands, rows, width)``, which begin at ``row``: the one after the last."""
-        assert row == self._rows[0]
-        self._add(0, bands)
-
-    def _add(self, level: int, bands: np.ndarray) -> None:
+    def write(self, bands: np.ndarray, level: int = 0) -> None:
+        """Write ``(bands, rows, width)``, the next rows of a level."""
         height, buffer = self._shapes[level][0], self._buffers[level]
         while bands.shape[1]:
             filled = self._rows[level] % BLOCK
@@ -74,7 +70,7 @@ class Stream:
         out.flush()
         self.parts[level].append(Part(sizes, (level, start)))
         if level + 1 < len(self._shapes):
-            self._add(level + 1, halved(rows))
+            self.write(halved(rows), level + 1)
 
     def copy_parts(self, path: Path, parts: Sequence[tuple[int, Part]]) -> None:
         """Write the parts into a file; see `CopyParts`."""

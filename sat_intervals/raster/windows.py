@@ -166,10 +166,7 @@ def read_small_layers(path: str | os.PathLike[str], shape: tuple[int, int]) -> n
 
 def read_small_image(image: Image, window: Window, shape: tuple[int, int]) -> np.ndarray:
     """Read a window inside an image as ``shape`` pixels, averaged, through overviews; NaN where not usable."""
-    picked, state = read_inside(image, window, shape)
-    if shape == (window.height, window.width):
-        means = picked
-    else:
-        with opened(image.path, window) as dataset:
-            means = dataset.read(image.band, window=window.slices, out_shape=shape, resampling=Resampling.average)
+    _, state = read_inside(image, window, shape)
+    with opened(image.path, window) as dataset:
+        means = dataset.read(image.band, window=window.slices, out_shape=shape, resampling=Resampling.average)
     return np.where(state == 0, means, np.nan)

@@ -72,7 +72,7 @@ class OutputWriter:
                 if name not in self._streams:
                     self._streams[name] = Stream(file, disk_of(self.folder), self.shape)
                     self._opened.callback(self._streams[name].close)
-                self._streams[name].write(row, bands)
+                self._streams[name].write(bands)
 
     def assemble(self, file: File, levels: Sequence[Sequence[Part]], copy_parts: CopyParts) -> None:
         """Make a file of rows of blocks, see `cog.assemble`, under its temporary name."""

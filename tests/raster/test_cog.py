@@ -140,7 +140,7 @@ def test_stream__makes_the_parts_of_any_strips(tmp_path, rows):
     bands = noise(INTERVALS, 1100, 40)
     stream = Stream(INTERVALS, tmp_path, bands.shape[1:])
     for row in range(0, 1100, rows):
-        stream.write(row, bands[:, row : row + rows])
+        stream.write(bands[:, row : row + rows])
     expected = parts_of(bands, INTERVALS)
     for found, wanted in zip(stream.parts, expected, strict=True):
         assert [part.sizes for part in found] == [part.sizes for part in wanted]
