@@ -19,7 +19,7 @@ from sat_intervals.run.beside import compiled_beside
 from sat_intervals.run.connection import Connection
 from sat_intervals.run.each import EachOnWorkers
 from sat_intervals.run.job import Job, open_job
-from sat_intervals.run.tile import match_block, trace_block
+from sat_intervals.run.tile import match_or_trace
 from sat_intervals.run.workers import Task, Workers, check_not_full, reason
 from sat_intervals.store.lock import locked
 from sat_intervals.store.tiles import BORDERS, COSTS, FAILURES, PIXELS, DamagedTilesError
@@ -246,5 +246,4 @@ def _tasks(jobs: Sequence[Job], schedules: Sequence[Schedule]) -> Iterator[Task 
         if step is None:
             yield None
         else:
-            function, arguments = (match_block, step[:1]) if step.wavefront is None else (trace_block, step)
-            yield Task((i, step), function, (jobs[i], *arguments), jobs[i].config.cluster.retries)
+            yield Task((i, step), match_or_trace, (jobs[i], *step), jobs[i].config.cluster.retries)
