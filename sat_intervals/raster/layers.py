@@ -53,10 +53,12 @@ def write_layer(
         temporary.write_bytes(memory.getbuffer())
 
 
-def png_of(pixels: np.ndarray, describe: Callable[[DatasetWriter], None] = lambda dataset: None) -> bytes:
+def png_of(
+    pixels: np.ndarray, nodata: float | None = None, describe: Callable[[DatasetWriter], None] = lambda dataset: None
+) -> bytes:
     """Return a picture: ``(bands, rows, columns)``, grey or colours, and opacity; ``describe`` adds what is not one."""
     count, height, width = pixels.shape
-    kind = {"count": count, "height": height, "width": width, "dtype": pixels.dtype.name}
+    kind = {"count": count, "height": height, "width": width, "dtype": pixels.dtype.name, "nodata": nodata}
     with Env(GDAL_PAM_ENABLED="NO"), MemoryFile() as plain, MemoryFile() as made:
         with gdal.create(plain.name, **kind) as dataset:
             dataset.write(pixels)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-from rasterio.io import DatasetWriter
 
 from sat_intervals.raster.cog import CopyParts, Part, assemble, template
 from sat_intervals.raster.files import File
@@ -91,15 +90,9 @@ class OutputWriter:
                     stream.close()
                 if file.name in self._pictures:
                     bands = np.concatenate(self._pictures[file.name], axis=1)
-                    made.temporary.write_bytes(png_of(bands, partial(self._describe, file)))
+                    made.temporary.write_bytes(png_of(bands, file.nodata, partial(file.describe, tags=self._tags)))
                 made.flush()
         return {name: file.temporary for name, file in self._unfinished.items()}
-
-    def _describe(self, file: File, dataset: DatasetWriter) -> None:
-        """Add tags, no data and descriptions to a picture."""
-        dataset.nodata = file.nodata
-        dataset.update_tags(**self._tags)
-        file.describe(dataset)
 
     def publish(self) -> None:
         """Finish all files and give them their names, in the order in which the files were given."""

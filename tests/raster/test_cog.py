@@ -121,8 +121,7 @@ def test_assemble__has_the_tags_of_gdals_own_driver(tmp_path):
     write(tmp_path / "ours.tif", bands, VALIDITY, place)
     options = {"count": 1, "dtype": "uint16", **place.creation_options()}
     with rasterio.open(tmp_path / "plain.tif", "w", driver="GTiff", height=600, width=700, **options) as plain:
-        plain.update_tags(ALPHA="0.9")
-        VALIDITY.describe(plain)
+        VALIDITY.describe(plain, {"ALPHA": "0.9"})
         plain.write(bands)
     driver = {"driver": "COG", "compress": "DEFLATE", "overview_resampling": "NEAREST"}
     rasterio.shutil.copy(tmp_path / "plain.tif", tmp_path / "theirs.tif", **driver)
