@@ -20,9 +20,8 @@ from sat_intervals.prepare.pair import Rows
 from sat_intervals.progress import Progress
 from sat_intervals.raster import BLOCK, File, OutputWriter, Part, codec_versions, compressed, factors, halved
 from sat_intervals.run.workers import Task, Threads, Workers, computing, results
-from sat_intervals.store.arrays import DamagedFileError
 from sat_intervals.store.manifest import digest
-from sat_intervals.store.tiles import PARTS, DamagedTilesError, Store
+from sat_intervals.store.tiles import PARTS, Store
 from sat_intervals.tiling import Window
 
 PartKey = tuple[int, int]
@@ -63,6 +62,12 @@ class Parts:
                 "sat-intervals and rasterio for all"
             )
 
+    def read(self, key: PartKey, names: Sequence[str]) -> list[np.ndarray]:
+        """Read arrays of a part; delete it and raise DamagedTilesError if it is damaged or missing."""
+        if (arrays := self.store.read(PARTS, part_name(key), names, self.of)) is None:
+            raise self.store.damaged(PARTS, [part_name(key)], self.of)
+        return arrays
+
     def window(self, key: PartKey) -> Window:
         """Return the pixels that a part is made of."""
         level, row = key
@@ -96,7 +101,6 @@ def finish_parts(
     keys = [(level, row) for level in reversed(range(len(counts))) for row in range(counts[level])]
     done = {key for key in keys if store.meta(PARTS, part_name(key), of)}
     waiting = [key for key in keys if key not in done]
-    damaged: list[str] = []
 
     def tasks() -> Iterator[Task | None]:
         while waiting:
@@ -113,13 +117,8 @@ def finish_parts(
         progress(stage, min(parts.shape[0], BLOCK * sum(level == 0 for level, _ in done)), parts.shape[0])
 
     look()
-    for key, damage in results(workers, tasks(), lambda key: failed(parts.window(key)), look) if waiting else ():
-        if damage is None:
-            done.add(key)
-        else:
-            damaged.append(damage)  # the other strips are finished before tiles are matched again
-    if damaged:
-        raise DamagedTilesError(damaged[0])
+    for key, _ in results(workers, tasks(), lambda key: failed(parts.window(key)), look) if waiting else ():
+        done.add(key)
     found = {key: meta for key in keys if (meta := store.meta(PARTS, part_name(key), of)) is not None}
     if missing := [part_name(key) for key in keys if key not in found]:
         raise store.damaged(PARTS, missing, of)
@@ -132,28 +131,19 @@ def _below(key: PartKey, counts: Sequence[int]) -> list[PartKey]:
     return [(level - 1, below) for below in (2 * row, 2 * row + 1) if level and below < counts[level - 1]]
 
 
-def make_part(parts: Parts, key: PartKey, function: Callable[..., Rows], arguments: tuple[Any, ...]) -> str | None:
-    """Make a part with a function; return what is wrong if files that it reads are damaged. Runs on a worker."""
+def make_part(parts: Parts, key: PartKey, function: Callable[..., Rows], arguments: tuple[Any, ...]) -> None:
+    """Make a part with a function; runs on a worker."""
     # also while it reads and writes: more strips at once would need more memory than `check_tiles` allows for
     with computing(parts.cluster):
         parts.check()
-        try:
-            rasters, noted = function(*arguments)
-        except DamagedTilesError as error:
-            return str(error)
+        rasters, noted = function(*arguments)
         write_part(parts, key, rasters, **noted)
-    return None
 
 
 def reduce_rows(parts: Parts, below: Sequence[PartKey]) -> Rows:
     """Make a row of blocks of an overview from parts of the level below."""
-    halves = []
-    for part in map(part_name, below):
-        try:
-            with parts.store.opened(PARTS, part, parts.of) as archive:
-                halves.append([archive[_HALF.format(file.name)] for file in parts.files])
-        except DamagedFileError as error:
-            raise parts.store.damaged(PARTS, [part], parts.of) from error
+    names = [_HALF.format(file.name) for file in parts.files]
+    halves = [parts.read(key, names) for key in below]
     return [np.concatenate(of_file, axis=1) for of_file in zip(*halves, strict=True)], {}
 
 
@@ -183,7 +173,7 @@ def copy_parts(
     progress: Progress,
 ) -> None:
     """Copy finished parts into the files, on workers that share their folder, else (None) in this process."""
-    copied: list[str | None] = []
+    copied: list[Any] = []
 
     def look(_: int) -> None:
         progress("files", len(copied), len(parts.files) * len(metas))
@@ -195,8 +185,8 @@ def copy_parts(
                 Task(part.source, copy_part, (parts, *part.source, path.absolute(), offset), parts.cluster.retries)
                 for offset, part in of_file
             )
-            for _, name in results(copiers, tasks, lambda _: f"{final} could not be written", look):
-                copied.append(name)
+            for source, _ in results(copiers, tasks, lambda _: f"{final} could not be written", look):
+                copied.append(source)
 
         look(0)
         for file in parts.files:
@@ -205,22 +195,15 @@ def copy_parts(
                 for level, count in enumerate(parts.rows)
             ]
             writer.assemble(file, levels, partial(copy, writer.folder / file.name))
-    if damaged := sorted({name for name in copied if name}):
-        raise parts.store.damaged(PARTS, damaged, parts.of)
 
 
-def copy_part(parts: Parts, key: PartKey, name: str, path: Path, offset: int) -> str | None:
-    """Write a part into a file at an offset; return its name if it is damaged or missing. Runs on a worker."""
+def copy_part(parts: Parts, key: PartKey, name: str, path: Path, offset: int) -> None:
+    """Write a part into a file at an offset; runs on a worker."""
     parts.check()
-    try:
-        with parts.store.opened(PARTS, part_name(key), parts.of) as archive:
-            content = archive[name]
-    except DamagedFileError:
-        return part_name(key)
+    (content,) = parts.read(key, [name])
     # not for reading: NFS would write whole pages, over bytes of the neighbours
     with open(os.open(path, os.O_WRONLY), "wb") as stream:
         stream.seek(offset)
         stream.write(content.data)
         stream.flush()
         os.fsync(stream.fileno())
-    return None

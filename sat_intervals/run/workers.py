@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol
 from sat_intervals.config import Cluster, ConfigError
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.machine import usable_cores
+from sat_intervals.store.tiles import DamagedTilesError
 
 CHECK_EVERY = 2.0  # seconds after which the caller is asked for more tasks, if no task has ended
 _FULL_DISK = errno.ENOSPC, errno.EDQUOT
@@ -53,11 +54,17 @@ def results(
     failed: Callable[[Any], str],
     look: Callable[[int], None],
 ) -> Iterator[tuple[Any, Any]]:
-    """Yield label and result of each task; ``failed`` says which one failed, ``look`` is given the number done."""
-    done = 0
+    """Yield label and result of each task; ``failed`` says which one failed, ``look`` is given the number done.
+
+    Where files are damaged the other tasks are done before the error.
+    """
+    done, damaged = 0, list[DamagedTilesError]()
     for outcome in workers.outcomes(tasks):
         if outcome is not None:
-            if (error := outcome.error) is not None:
+            if isinstance(error := outcome.error, DamagedTilesError):
+                damaged.append(error)
+                continue
+            if error is not None:
                 if isinstance(error, SatIntervalsError):  # names files and the way out
                     raise error
                 check_not_full(error, what := failed(outcome.label))
@@ -65,6 +72,8 @@ def results(
             done += 1
             yield outcome.label, outcome.result
         look(done)
+    if damaged:
+        raise damaged[0]
 
 
 def readers(settings: Cluster) -> int:

@@ -59,10 +59,10 @@ class Store:
         """Open a file for reading; see `unpacked`."""
         return unpacked(self.folder, f"{kind}/{name}.npz", of or self.run)
 
-    def read(self, kind: str, name: str, wanted: Collection[str] | None = None) -> list[np.ndarray] | None:
-        """Read all arrays of a file, or the ``wanted`` ones; None if it is missing or damaged."""
-        with suppress(DamagedFileError), self.opened(kind, name) as archive:
-            return [archive[key].copy() for key in (archive.names() if wanted is None else wanted)]
+    def read(self, kind: str, name: str, wanted: Collection[str] = (), of: str = "") -> list[np.ndarray] | None:
+        """Read all arrays of a file, or the ``wanted`` ones if any; None if it is missing or damaged."""
+        with suppress(DamagedFileError), self.opened(kind, name, of) as archive:
+            return [archive[key].copy() for key in wanted or archive.names()]
         return None
 
     def meta(self, kind: str, name: str, of: str = "") -> dict[str, Any] | None:
