@@ -1,7 +1,6 @@
 """Clusters of dask, and tasks on them, a bounded number at a time; dask repeats these and replaces lost workers."""
 
 import asyncio
-import itertools
 import logging
 import signal
 import time
@@ -48,8 +47,6 @@ class DaskWorkers:
 
     def __init__(self, client: Client) -> None:
         self._client = client
-        self._run = uuid.uuid4().hex  # unique, since a scheduler may serve several runs
-        self._numbers = itertools.count()
         self._cores: dict[str, int] = {}
         self._checked = float("-inf")
         self._seen: float | None = None  # time of the last worker
@@ -95,7 +92,7 @@ class DaskWorkers:
             _LOG.warning("there is no worker yet%s", where)
 
     def _submit(self, task: Task) -> Future[Outcome]:
-        key = f"{task.function.__name__}-{self._run}-{next(self._numbers)}"
+        key = f"{task.function.__name__}-{uuid.uuid4().hex}"  # unique, since a scheduler may serve several runs
         with _scheduler_errors():
             future = self._client.submit(
                 called, task.function, *task.arguments, key=key, retries=task.retries, pure=False
