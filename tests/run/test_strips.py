@@ -2,7 +2,6 @@
 
 import errno
 import shutil
-import subprocess
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 import psutil
 import pytest
 import rasterio
-from helpers import COMMAND, LOCK, OUTPUTS, PLACE, hashes, invoke, wait_until, write_pair
+from helpers import LOCK, OUTPUTS, PLACE, ended, hashes, invoke, started, wait_until, write_pair
 
 import sat_intervals
 from sat_intervals.config import Cluster, load_config
@@ -267,34 +266,18 @@ def test_status__counts_strips(tall, tmp_path, monkeypatch):
     assert "5 of 5 tiles done, 0 failed, 0 left, 1 of 4 strips done; no run is active" in result.output
 
 
-class Second:
-    """``sat-intervals match`` as a process, from tiles that are all done."""
-
-    def __init__(self, tall, out: Path, *options: str) -> None:
-        folder = tall[0]
-        command = [COMMAND, "match", folder / "left.tif", folder / "right.tif", out, "--quiet"]
-        command += ["--config", folder / "settings.yaml", *options]
-        self.process = subprocess.Popen(list(map(str, command)), stdout=subprocess.DEVNULL)
-
-    def __enter__(self):
-        return self.process
-
-    def __exit__(self, *error) -> None:
-        self.process.kill()
-        self.process.wait()
-
-
 @pytest.mark.process
 @pytest.mark.parametrize("cluster", ["threads", "processes"])
 def test_match__goes_on_after_kill_9_in_every_stage_of_its_second_half(tall, tmp_path, cluster):
-    out = with_tiles(tall, tmp_path / "out")
+    folder, out = tall[0], with_tiles(tall, tmp_path / "out")
+    command = "match", folder / "left.tif", folder / "right.tif", out, "--config", folder / "settings.yaml"
     seen: dict[str, int] = {}
     for count in (1, 4, PARTS, "file"):
 
         def reached(count=count):
             return list(out.glob(".validity.tif.part")) if count == "file" else len(parts(out)) >= count
 
-        with Second(tall, out, "--cluster", cluster) as process:
+        with started(*command, "--cluster", cluster) as process:
             wait_until(lambda: reached() or process.poll() is not None, f"{count}")
             children = psutil.Process(process.pid).children() if process.poll() is None else []
             process.kill()
@@ -306,7 +289,7 @@ def test_match__goes_on_after_kill_9_in_every_stage_of_its_second_half(tall, tmp
         now = parts(out)
         assert {name: now[name] for name in seen} == seen, "done twice"
         seen = now
-    with Second(tall, out, "--cluster", cluster) as process:
-        assert process.wait(60) == 0
+    with started(*command, "--cluster", cluster) as process:
+        assert ended(process, 60)[0] == 0
     assert hashes(out) == hashes(tall[0] / "kept")
     assert sorted(path.name for path in out.iterdir()) == [LOCK, *OUTPUTS]
