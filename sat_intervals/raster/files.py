@@ -38,11 +38,6 @@ class File:
     compression: str = "deflate"
 
     @property
-    def kind(self) -> str:
-        """Return the name without its suffix."""
-        return self.name.partition(".")[0]
-
-    @property
     def is_of_heights(self) -> bool:
         """Return whether its first band is metres: then its CRS is vertical, too."""
         return self.bands[0].unit == "m"
