@@ -282,5 +282,4 @@ def open_input(record: dict[str, Any]) -> Image:
     nodata = record["nodata"]
     if name.startswith("/") and not name.startswith("/vsi") and not Path(name).exists():
         raise SatIntervalsError(f"{name}, an image of the run, is missing: move it back, or put a link to it there")
-    nodata = None if nodata is None else float(nodata)
-    return open_image(name, band=record["band"], nodata=nodata, mask=mask and mask["path"])
+    return open_image(name, band=record["band"], nodata=nodata and float(nodata), mask=mask and mask["path"])

@@ -44,8 +44,7 @@ def write_file(path, file, bands, place=NOWHERE, tags=None):
     count, height, width = bands.shape
     kind = {"count": count, "height": height, "width": width, "dtype": file.dtype, "nodata": file.nodata}
     with Env(), gdal.create(str(path), **kind, **place.creation_options()) as dataset:
-        dataset.update_tags(**tags or {})
-        file.describe(dataset)
+        file.describe(dataset, tags or {})
         dataset.write(bands)
 
 

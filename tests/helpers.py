@@ -2,9 +2,11 @@
 
 import hashlib
 import json
+import subprocess
 import sysconfig
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +60,23 @@ def calibration(config: Config, high: float, low: float, quantile: float | None)
 def invoke(*arguments: object) -> Result:
     """Run a command in this process."""
     return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+@contextmanager
+def started(*arguments: object) -> Iterator[subprocess.Popen]:
+    """A command as a process of its own that does not outlive the test."""
+    command = [str(argument) for argument in (COMMAND, *arguments, "--quiet")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def ended(process: subprocess.Popen, seconds: float = PATIENCE) -> tuple[int, str]:
+    """Status and output of a process at its end."""
+    output, _ = process.communicate(timeout=seconds)
+    return process.returncode, output
 
 
 def wait_until(holds: Callable[[], object], what: str, seconds: float = PATIENCE) -> None:

@@ -12,6 +12,7 @@ from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.products import RANGES
 from sat_intervals.raster import Image, Layer, OutputWriter, open_image, ranges_file, read_shape, read_window
 from sat_intervals.raster.identity import identity
+from sat_intervals.raster.images import check_size
 from sat_intervals.raster.layers import tag_of_left, tags_beside
 from sat_intervals.tiling import Window
 
@@ -32,11 +33,7 @@ def given_ranges(search: Disparity, left: Image) -> tuple[LocalRanges, str] | No
 def _ranges_around(path: str, left: Image, margin: int) -> LocalRanges:
     """Read the disparities of another matcher, and return the ranges around them."""
     raster = open_image(path, band=1)
-    if (raster.height, raster.width) != (left.height, left.width):
-        raise SatIntervalsError(
-            f"{path} has {raster.height} x {raster.width} pixels, {left.path} {left.height} x {left.width}: give the "
-            "disparity of each pixel of the left image"
-        )
+    check_size(path, (raster.height, raster.width), left, "give the disparity of each pixel of the left image")
     _check_grid(raster, left)
     windows = (Window(row, 0, min(CELL, left.height - row), left.width) for row in range(0, left.height, CELL))
     return ranges_around((Layer(raster, 0, 0).read(window) for window in windows), margin)

@@ -73,7 +73,7 @@ def _compressed(bands: np.ndarray, file: File) -> list[memoryview]:
     whole = np.zeros((count, BLOCK, -(-columns // BLOCK) * BLOCK), file.dtype)  # what is beyond the image is equal, too
     whole[:, :rows, :columns] = bands
     kind = {"height": BLOCK, "width": whole.shape[2], "count": count, "dtype": file.dtype, "nodata": file.nodata}
-    options = tiled(file) | _LEVELS[file.compression] | {"num_threads": 1}
+    options = tiled(file, BLOCK) | _LEVELS[file.compression] | {"num_threads": 1}
     with Env(), MemoryFile() as memory:
         with gdal.create(memory.name, **kind, **options) as dataset:
             dataset.write(whole)
@@ -87,12 +87,12 @@ def _compressed(bands: np.ndarray, file: File) -> list[memoryview]:
     return [content[offset : offset + size] for offset, size in places]
 
 
-def tiled(file: File) -> dict[str, Any]:
-    """Return the options of GDAL for the blocks of a file."""
+def tiled(file: File, side: int) -> dict[str, Any]:
+    """Return the options of GDAL for blocks of a file with so many pixels a side."""
     return {
         "tiled": True,
-        "blockxsize": BLOCK,
-        "blockysize": BLOCK,
+        "blockxsize": side,
+        "blockysize": side,
         "interleave": "band",
         "compress": file.compression,
         "predictor": _PREDICTORS[file.predictor],

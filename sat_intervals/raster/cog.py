@@ -60,17 +60,10 @@ def template(file: File, place: Georeferencing, tags: Mapping[str, str]) -> Temp
     kind = {"count": len(file.bands), "dtype": file.dtype, "nodata": file.nodata, "sparse_ok": True}
     options = {"COMPRESS": file.compression.upper(), "PREDICTOR": file.predictor, "BLOCKSIZE": _SMALL}
     # its bands are side by side, since the ghost area of newer versions would say that each follows the other
-    kind |= tiled(file) | {
-        "interleave": "pixel",
-        "blockxsize": _SMALL,
-        "blockysize": _SMALL,
-        "height": _SMALL + 1,
-        "width": _SMALL + 1,
-    }
+    kind |= tiled(file, _SMALL) | {"interleave": "pixel", "height": _SMALL + 1, "width": _SMALL + 1}
     with Env(GDAL_TIFF_ENDIANNESS="LITTLE"), MemoryFile() as small, MemoryFile() as made:
         with gdal.create(small.name, **kind, **place.creation_options()) as dataset:
-            dataset.update_tags(**tags)
-            file.describe(dataset)
+            file.describe(dataset, tags)
         copy(small.name, made.name, driver="COG", SPARSE_OK="YES", OVERVIEW_RESAMPLING="NEAREST", **options)
         ghost, directories = _parsed(bytes(made.getbuffer()))
     whole = directories[0]

@@ -38,17 +38,13 @@ class File:
     compression: str = "deflate"
 
     @property
-    def kind(self) -> str:
-        """Return the name without its suffix."""
-        return self.name.partition(".")[0]
-
-    @property
     def is_of_heights(self) -> bool:
         """Return whether its first band is metres: then its CRS is vertical, too."""
         return self.bands[0].unit == "m"
 
-    def describe(self, dataset: DatasetWriter) -> None:
-        """Write names, units and meanings of the bands."""
+    def describe(self, dataset: DatasetWriter, tags: Mapping[str, str]) -> None:
+        """Write tags, and names, units and meanings of the bands."""
+        dataset.update_tags(**tags)
         for index, band in enumerate(self.bands, start=1):
             dataset.set_band_description(index, band.name)
             dataset.update_tags(index, meaning=band.meaning)

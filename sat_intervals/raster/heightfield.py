@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from rasterio.io import DatasetReader
 from rasterio.transform import Affine
-from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster.images import open_image, opened
@@ -90,8 +89,7 @@ def warn_of_no_data(path: str | Path, window: Window | None = None) -> None:
     """Warn of a height that many cells have exactly, far from others; in a window, also of one that no ground has."""
     with opened(str(path)) as dataset:
         part = window or Window(0, 0, *dataset.shape)
-        shape = min(_LOOKED, part.height), min(_LOOKED, part.width)
-        where = {"window": RasterioWindow(part.column, part.row, part.width, part.height), "out_shape": shape}
+        where = {"window": part.slices, "out_shape": (min(_LOOKED, part.height), min(_LOOKED, part.width))}
         heights = dataset.read(1, **where)[dataset.read_masks(1, **where) != 0]
     heights = heights[np.isfinite(heights) if window else is_ground(heights)]
     values, counts = np.unique(heights, return_counts=True)

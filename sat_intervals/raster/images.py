@@ -104,11 +104,15 @@ def open_image(
         raise InputError(f"{name}: band {band} is {image.dtype}, matching needs real values: give its amplitude")
     if mask is not None:
         with opened(mask) as dataset:
-            shape = dataset.shape
-        if shape != (image.height, image.width):
-            sizes = f"{shape[0]} x {shape[1]} pixels, {name} {image.height} x {image.width}"
-            raise InputError(f"{mask} has {sizes}: give a mask of the image's size")
+            check_size(mask, dataset.shape, image, "give a mask of the image's size")
     return image
+
+
+def check_size(path: str, shape: tuple[int, int], image: Image, remedy: str) -> None:
+    """Raise if a raster has another number of rows or columns than an image."""
+    if shape != (image.height, image.width):
+        sizes = f"{shape[0]} x {shape[1]} pixels, {image.path} {image.height} x {image.width}"
+        raise InputError(f"{path} has {sizes}: {remedy}")
 
 
 def acquired(path: str) -> datetime | None:

@@ -13,7 +13,6 @@ from rasterio.crs import CRS
 from rasterio.io import DatasetWriter, MemoryFile
 from rasterio.shutil import copy
 from rasterio.transform import Affine
-from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
@@ -54,10 +53,12 @@ def write_layer(
         temporary.write_bytes(memory.getbuffer())
 
 
-def png_of(pixels: np.ndarray, describe: Callable[[DatasetWriter], None] = lambda dataset: None) -> bytes:
+def png_of(
+    pixels: np.ndarray, nodata: float | None = None, describe: Callable[[DatasetWriter], None] = lambda dataset: None
+) -> bytes:
     """Return a picture: ``(bands, rows, columns)``, grey or colours, and opacity; ``describe`` adds what is not one."""
     count, height, width = pixels.shape
-    kind = {"count": count, "height": height, "width": width, "dtype": pixels.dtype.name}
+    kind = {"count": count, "height": height, "width": width, "dtype": pixels.dtype.name, "nodata": nodata}
     with Env(GDAL_PAM_ENABLED="NO"), MemoryFile() as plain, MemoryFile() as made:
         with gdal.create(plain.name, **kind) as dataset:
             dataset.write(pixels)
@@ -68,9 +69,8 @@ def png_of(pixels: np.ndarray, describe: Callable[[DatasetWriter], None] = lambd
 
 def read_layers(path: str | os.PathLike[str], window: Window | None = None, band: int | None = None) -> np.ndarray:
     """Read ``(bands, rows, columns)`` of a file or a window inside it, or ``(rows, columns)`` of one band from 1."""
-    area = window and RasterioWindow(window.column, window.row, window.width, window.height)
     with opened(str(path), window) as dataset:
-        return np.asarray(dataset.read(band, window=area))
+        return np.asarray(dataset.read(band, window=window and window.slices))
 
 
 def read_known(path: str | os.PathLike[str]) -> np.ndarray:

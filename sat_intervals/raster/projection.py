@@ -63,15 +63,13 @@ class Projection:
             raise SatIntervalsError(f"{name} includes heights: give a horizontal CRS, and the geoid apart")
         self.crs = f"EPSG:{crs}" if crs.isdecimal() else crs
         self.definition = target
-        self._area = target.area_of_use
-        self._proj = Proj(target)
         self._map = Transformer.from_crs(_GEOGRAPHIC, target, always_xy=True)
         self._geoid = None if geoid is None else geoid_grid(geoid)
 
     def check(self, longitude: float, latitude: float) -> None:
         """Raise if the CRS or the geoid does not fit at a place (degrees)."""
         here = f"longitude {longitude:.2f}, latitude {latitude:.2f}"
-        area = self._area
+        area = self.definition.area_of_use
         if area is not None:
             away = (longitude - (area.west + area.east) / 2 + 180) % 360 - 180 if area.west <= area.east else 0.0
             beyond = abs(away) - (area.east - area.west) / 2, area.south - latitude, latitude - area.north
@@ -80,7 +78,7 @@ class Projection:
                     f"{self.crs} is for longitudes {area.west:g} to {area.east:g} and latitudes {area.south:g} to "
                     f"{area.north:g}, the points are at {here}: give a CRS of this area, or none for its UTM zone"
                 )
-        factors = self._proj.get_factors(longitude, latitude)
+        factors = Proj(self.definition).get_factors(longitude, latitude)
         scale = max(factors.meridional_scale, factors.parallel_scale, key=lambda factor: abs(factor - 1))
         if not abs(scale - 1) <= _LARGEST_DISTORTION:
             raise SatIntervalsError(

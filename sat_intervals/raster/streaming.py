@@ -26,11 +26,10 @@ class Stream:
     Rows that wait for a full row of blocks are in a file too, so that memory does not grow with the width.
     """
 
-    def __init__(self, file: File, folder: Path, shape: tuple[int, int], threads: int | None) -> None:
+    def __init__(self, file: File, folder: Path, shape: tuple[int, int]) -> None:
         """``folder``: where temporary files without names are made."""
         self._file = file
         self._folder = folder
-        self._threads = threads
         self._shapes = [(-(-shape[0] // factor), -(-shape[1] // factor)) for factor in factors(*shape)]
         self._rows = [0 for _ in self._shapes]
         with ExitStack() as files:
@@ -46,12 +45,8 @@ class Stream:
             os.posix_fallocate(stream.fileno(), 0, int(np.prod(shape)) * np.dtype(self._file.dtype).itemsize)
             return np.memmap(stream, self._file.dtype, "r+", shape=shape)
 
-    def write(self, row: int, bands: np.ndarray) -> None:
-        """Write ``(bands, rows, width)``, which begin at ``row``: the one after the last."""
-        assert row == self._rows[0]
-        self._add(0, bands)
-
-    def _add(self, level: int, bands: np.ndarray) -> None:
+    def write(self, bands: np.ndarray, level: int = 0) -> None:
+        """Write ``(bands, rows, width)``, the next rows of a level."""
         height, buffer = self._shapes[level][0], self._buffers[level]
         while bands.shape[1]:
             filled = self._rows[level] % BLOCK
@@ -68,14 +63,14 @@ class Stream:
         columns = (rows[:, :, first : first + step] for first in range(0, rows.shape[2], step))
         out = self._strips[level]
         start, sizes = out.tell(), list[int]()
-        with ThreadPoolExecutor(self._threads or usable_cores()) as pool:
+        with ThreadPoolExecutor(usable_cores()) as pool:
             for blocks in pool.map(partial(compressed, file=self._file), columns):
                 out.write(blocks.content)
                 sizes += blocks.sizes
         out.flush()
         self.parts[level].append(Part(sizes, (level, start)))
         if level + 1 < len(self._shapes):
-            self._add(level + 1, halved(rows))
+            self.write(halved(rows), level + 1)
 
     def copy_parts(self, path: Path, parts: Sequence[tuple[int, Part]]) -> None:
         """Write the parts into a file; see `CopyParts`."""

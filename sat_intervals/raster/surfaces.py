@@ -11,7 +11,6 @@ from rasterio.enums import MaskFlags, Resampling
 from rasterio.transform import Affine, array_bounds
 from rasterio.vrt import WarpedVRT
 from rasterio.warp import calculate_default_transform, reproject, transform_bounds
-from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import SURFACE
@@ -117,7 +116,7 @@ def read_heights(
     height, width = shape
     grid = {"crs": place.crs, "transform": place.transform, "height": height, "width": width}
     grid |= {"resampling": Resampling.bilinear if smooth else Resampling.nearest}
-    area = RasterioWindow(window.column, window.row, window.width, window.height)
+    area = window.slices
     with opened(str(path), window) as dataset:
         try:
             with WarpedVRT(dataset, dtype="float64", nodata=np.nan, **grid) as warped:
@@ -156,9 +155,8 @@ def ground_of(path: Path, bounds: Bounds, around: float) -> tuple[np.ndarray, Ge
     heights, given = np.full((rows, columns), np.nan), {"src_crs": place.crs, "src_nodata": np.nan}
     wanted = {"dst_crs": degrees, "dst_transform": grid.transform, "resampling": Resampling.bilinear}
     with opened(str(path), near) as dataset:
-        area = RasterioWindow(near.column, near.row, near.width, near.height)
-        known = dataset.read(1, window=area) * dataset.scales[0] + dataset.offsets[0]
-        known[(dataset.read_masks(1, window=area) == 0) | ~is_ground(known)] = np.nan
+        known = dataset.read(1, window=near.slices) * dataset.scales[0] + dataset.offsets[0]
+        known[(dataset.read_masks(1, window=near.slices) == 0) | ~is_ground(known)] = np.nan
     reproject(known, heights, src_transform=place.shifted(near).transform, **given, **wanted)
     margin = floor(around / cell)
     outside = np.ones(heights.shape, bool)

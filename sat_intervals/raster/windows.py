@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from rasterio.enums import Resampling
-from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.errors import InputError
 from sat_intervals.kernels.resampling import Step, reduced
@@ -128,7 +127,7 @@ def _check_exact(path: str, values: np.ndarray, usable: np.ndarray) -> None:
 
 def read_inside(image: Image, window: Window, shape: tuple[int, int] | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Read values, in the file's type, and states of a window inside the image, sampled to ``shape`` if given."""
-    area = RasterioWindow(window.column, window.row, window.width, window.height)
+    area = window.slices
     with opened(image.path, window) as dataset:
         values = dataset.read(image.band, window=area, out_shape=shape)
         usable = np.isfinite(values) & _differs(values, image.nodata)
@@ -167,11 +166,7 @@ def read_small_layers(path: str | os.PathLike[str], shape: tuple[int, int]) -> n
 
 def read_small_image(image: Image, window: Window, shape: tuple[int, int]) -> np.ndarray:
     """Read a window inside an image as ``shape`` pixels, averaged, through overviews; NaN where not usable."""
-    picked, state = read_inside(image, window, shape)
-    if shape == (window.height, window.width):
-        means = picked
-    else:
-        area = RasterioWindow(window.column, window.row, window.width, window.height)
-        with opened(image.path, window) as dataset:
-            means = dataset.read(image.band, window=area, out_shape=shape, resampling=Resampling.average)
+    _, state = read_inside(image, window, shape)
+    with opened(image.path, window) as dataset:
+        means = dataset.read(image.band, window=window.slices, out_shape=shape, resampling=Resampling.average)
     return np.where(state == 0, means, np.nan)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-from rasterio.io import DatasetWriter
 
 from sat_intervals.raster.cog import CopyParts, Part, assemble, template
 from sat_intervals.raster.files import File
@@ -23,7 +22,7 @@ class OutputWriter:
     """Write files of a folder from full-width strips in increasing order, or from parts that were made elsewhere.
 
     Until `publish` all files have temporary names, see `new_file`; leaving the context removes these. All methods raise
-    `OutputError` with the final name. Pictures (PNG) are kept in memory. ``threads`` compress, None: one per core.
+    `OutputError` with the final name. Pictures (PNG) are kept in memory.
     """
 
     def __init__(
@@ -34,32 +33,24 @@ class OutputWriter:
         width: int,
         georeferencing: Georeferencing,
         tags: Mapping[str, str],
-        *,
-        threads: int | None = None,
     ) -> None:
         self.folder = path_of(folder)
-        self._files = {file.name: file for file in files}
+        self.files = tuple(files)
         self.shape = height, width
         self._georeferencing = georeferencing
         self._tags = dict(tags)
-        self._threads = threads
         self._opened = ExitStack()
         self._unfinished: dict[str, Unfinished] = {}
         self._streams: dict[str, Stream] = {}
         self._pictures: dict[str, list[np.ndarray]] = {}  # strips
 
-    @property
-    def files(self) -> tuple[File, ...]:
-        """Return the files."""
-        return tuple(self._files.values())
-
     def __enter__(self) -> Self:
         with failing(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
         with ExitStack() as stack:
-            for name in self._files:
-                self._unfinished[name] = stack.enter_context(unfinished(self.folder / name))
-            check_space(self.folder, file_bytes([*self._files.values()], *self.shape), "files")
+            for file in self.files:
+                self._unfinished[file.name] = stack.enter_context(unfinished(self.folder / file.name))
+            check_space(self.folder, file_bytes(self.files, *self.shape), "files")
             self._opened = stack.pop_all()
         return self
 
@@ -69,45 +60,39 @@ class OutputWriter:
     def write(self, row: int, *rasters: np.ndarray) -> None:
         """Write the strip that begins at ``row``; one array per file, ``(bands, rows, width)`` or ``(rows, width)``."""
         if not row:  # parts, too
-            check_space(self.folder, 2 * file_bytes([*self._files.values()], *self.shape), "files")
-        for (name, file), raster in zip(self._files.items(), rasters, strict=True):
+            check_space(self.folder, 2 * file_bytes(self.files, *self.shape), "files")
+        for file, raster in zip(self.files, rasters, strict=True):
+            name = file.name
             bands = np.ascontiguousarray(raster.reshape(-1, *raster.shape[-2:]), file.dtype)
             with failing(self.folder / name):
                 if file.driver == "PNG":
                     self._pictures.setdefault(name, []).append(bands)
                     continue
                 if name not in self._streams:
-                    self._streams[name] = Stream(file, disk_of(self.folder), self.shape, self._threads)
+                    self._streams[name] = Stream(file, disk_of(self.folder), self.shape)
                     self._opened.callback(self._streams[name].close)
-                self._streams[name].write(row, bands)
+                self._streams[name].write(bands)
 
-    def assemble(self, name: str, levels: Sequence[Sequence[Part]], copy_parts: CopyParts) -> None:
+    def assemble(self, file: File, levels: Sequence[Sequence[Part]], copy_parts: CopyParts) -> None:
         """Make a file of rows of blocks, see `cog.assemble`, under its temporary name."""
-        with failing(self.folder / name):
-            made = template(self._files[name], self._georeferencing, self._tags)
-            assemble(self._unfinished[name].temporary, made, self.shape, levels, copy_parts)
+        with failing(self.folder / file.name):
+            made = template(file, self._georeferencing, self._tags)
+            assemble(self._unfinished[file.name].temporary, made, self.shape, levels, copy_parts)
 
     def build(self) -> dict[str, Path]:
         """Finish all files under their temporary names, and return these by name."""
-        for name, stream in self._streams.items():
-            with failing(self.folder / name):
-                stream.check_complete()
-            self.assemble(name, stream.parts, stream.copy_parts)
-            stream.close()
-        self._streams.clear()
-        for name, file in self._unfinished.items():
-            with failing(file.path):
-                if name in self._pictures:
-                    bands = np.concatenate(self._pictures[name], axis=1)
-                    file.temporary.write_bytes(png_of(bands, partial(self._describe, self._files[name])))
-                file.flush()
+        for file in self.files:
+            made = self._unfinished[file.name]
+            with failing(made.path):
+                if stream := self._streams.pop(file.name, None):
+                    stream.check_complete()
+                    self.assemble(file, stream.parts, stream.copy_parts)
+                    stream.close()
+                if file.name in self._pictures:
+                    bands = np.concatenate(self._pictures[file.name], axis=1)
+                    made.temporary.write_bytes(png_of(bands, file.nodata, partial(file.describe, tags=self._tags)))
+                made.flush()
         return {name: file.temporary for name, file in self._unfinished.items()}
-
-    def _describe(self, file: File, dataset: DatasetWriter) -> None:
-        """Add tags, no data and descriptions to a picture."""
-        dataset.nodata = file.nodata
-        dataset.update_tags(**self._tags)
-        file.describe(dataset)
 
     def publish(self) -> None:
         """Finish all files and give them their names, in the order in which the files were given."""

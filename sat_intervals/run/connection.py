@@ -32,9 +32,8 @@ class Connection(ExitStack):
         return self._workers.outcomes(tasks)
 
     def _started(self) -> Workers:
-        settings = self.settings
-        if settings.kind == "threads":
-            return self.enter_context(closing(Threads(cores_of_process(settings), readers(settings))))
+        if self.settings.kind == "threads":
+            return self.enter_context(closing(Threads(cores_of_process(self.settings), readers(self.settings))))
         from sat_intervals.run.submit import DaskWorkers, connected
 
-        return DaskWorkers(self.enter_context(connected(settings, self._out)))
+        return DaskWorkers(self.enter_context(connected(self.settings, self._out)))

@@ -11,23 +11,15 @@ from typing import Any
 from sat_intervals.config import Cluster
 from sat_intervals.prepare.pair import RowArguments, Rows
 from sat_intervals.progress import Progress
-from sat_intervals.raster import BLOCK, OutputWriter, RemotePath
+from sat_intervals.raster import OutputWriter, RemotePath
 from sat_intervals.raster.publishing import check_space, file_bytes, part_bytes
 from sat_intervals.run.connection import Connection
-from sat_intervals.run.parts import PartKey, Parts, codecs_of, copy_parts, finish_parts, write_part
+from sat_intervals.run.parts import Parts, codecs_of, copy_parts, finish_parts
 from sat_intervals.run.state import with_store
-from sat_intervals.run.workers import (
-    Task,
-    computing,
-    is_remote,
-    picklable_errors,
-    reason,
-    results,
-)
+from sat_intervals.run.workers import Task, is_remote, reason, results
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import digest
 from sat_intervals.store.tiles import NO_TILES, PARTS, Store
-from sat_intervals.tiling import Window
 
 _RETRIES = 2
 
@@ -45,19 +37,16 @@ class EachOnWorkers:
         self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], stage: str
     ) -> Iterator[tuple[int, Any]]:
         """Yield results with the number of their arguments, as they come."""
-        tasks = (Task(i, _called, (function, each), _RETRIES) for i, each in enumerate(arguments))
-
-        def failed(_: int) -> str:
-            return f"{_FOUND[stage]} could not be found"
-
+        tasks = (Task(i, function, each, _RETRIES) for i, each in enumerate(arguments))
+        failed = f"{_FOUND[stage]} could not be found"
         self.progress(stage, 0, len(arguments))
-        return results(self.workers, tasks, failed, lambda done: self.progress(stage, done, len(arguments)))
+        return results(self.workers, tasks, lambda _: failed, lambda done: self.progress(stage, done, len(arguments)))
 
     def write_rows(
         self, writer: OutputWriter, function: Callable[..., Rows], arguments: RowArguments, stage: str
     ) -> list[dict[str, Any]]:
         """Write files of parts that workers make, see `Pool`; the parts are beside the files, or in the store."""
-        files, shape, whole = writer.files, writer.shape, Window(0, 0, *writer.shape)
+        files, shape = writer.files, writer.shape
         connection, first = self.workers, writer.folder / files[0].name
         cluster = with_store(connection.settings, writer.folder)
         store = cluster.store
@@ -65,30 +54,21 @@ class EachOnWorkers:
         name = str(first) if isinstance(first, RemotePath) else f"{platform.node()} {first.absolute()}"
         place = f"{store}/{digest(name)}" if store else first.with_name(f".{first.name}.parts")
         run = uuid.uuid4().hex  # parts of a command that died are not used again
-        parts = Parts(Store(folder_at(place), NO_TILES, run), files, shape, run, codecs_of(files), cluster.retries)
+        parts = Parts(Store(folder_at(place), NO_TILES, run), files, shape, run, codecs_of(files), cluster)
         if not store:
             check_space(writer.folder, part_bytes(files, *shape) + file_bytes(files, *shape), "files and their parts")
-
-        def row(key: PartKey) -> tuple[Callable[..., None], tuple[Any, ...]]:
-            window = Window(BLOCK * key[1], 0, BLOCK, shape[1]).clipped(whole)
-            return _write_row, (parts, key, cluster, function, arguments(window))
-
-        def failed(_: PartKey) -> str:
-            return f"{first} could not be written"
-
-        def look(done: int) -> None:
-            self.progress(stage, min(shape[0], BLOCK * done), shape[0])
-
+        failed = f"{first} could not be written"
         _remove(parts)
-        look(0)
         try:
-            noted = finish_parts(parts, connection, row, failed, look)
+            noted = finish_parts(
+                parts, connection, lambda rows: (function, arguments(rows)), lambda _: failed, stage, self.progress
+            )
             copy_parts(parts, noted, writer, None if store else connection, self.progress)
         except BaseException:
             connection.at_end.callback(_remove, parts)  # once no worker writes any more
             raise
         _remove(parts)
-        return [noted[0, number]["noted"] for number in range(parts.rows[0])]
+        return [noted[0, number] for number in range(parts.rows[0])]
 
 
 def pool_of(connection: Connection, out: Path, progress: Progress) -> EachOnWorkers:
@@ -105,15 +85,6 @@ def _remove(parts: Parts) -> None:
         _LOG.warning("parts of files stay in %s: %s", parts.store.folder, reason(error))
 
 
-def _write_row(
-    parts: Parts, key: PartKey, cluster: Cluster, function: Callable[..., Rows], arguments: tuple[Any, ...]
-) -> None:
-    with picklable_errors(), computing(cluster):
-        parts.check()
-        rasters, noted = function(*arguments)
-        write_part(parts, key, rasters, noted=noted)
-
-
 _FOUND = {
     "range": "the search range",
     "rows": "row offsets",
@@ -123,8 +94,3 @@ _FOUND = {
     "extent": "the extent of the surface",
     "alignment": "the shifts of the runs",
 }
-
-
-def _called(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
-    with picklable_errors():
-        return function(*arguments)

@@ -251,12 +251,10 @@ def job_of(
     read = [*identities(inputs), *(files_of(config.disparity.grid) if config.disparity.grid else ())]
     manifest = _manifest(prepared, relative_in(out, inputs), region)
     run = digest(manifest)
-    folder = folder_at(home_of(out))
-    if config.cluster.store:
-        folder = folder_at(f"{folder_at(config.cluster.store)}/{'-'.join(filter(None, (pair, run)))}")
-    manifest[PLACE] = None if folder == folder_at(home_of(out)) else str(folder)
+    store = config.cluster.store
+    manifest[PLACE] = f"{folder_at(store)}/{'-'.join(filter(None, (pair, run)))}" if store else None
     check_not_replaced(read, [out / name for name in outputs_of(config)], [home_of(out)])
-    kept = Store(folder, Grid(region, config.tiles.size), run)
+    kept = Store(place_of(home_of(out), manifest), Grid(region, config.tiles.size), run)
     return Job(prepared, kept, out, manifest, requested, overwrite, swept=swept)
 
 
@@ -318,21 +316,13 @@ def _identity(ground: GroundViews) -> dict[str, Any]:
 def _manifest(prepared: Prepared[FilePair], inputs: Mapping[str, Any], region: Window) -> dict[str, Any]:
     """Return all that decides the bytes of a tile; of a calibration only its levels."""
     config = prepared.config
-    ranges = prepared.ranges
-    rows = prepared.rows
     settings = config.model_dump(mode="json", exclude=_NOT_OF_TILES)
-    levels = config.cuts
-    if levels is not None:
-        settings["interval"] = {
-            "high": levels.high,
-            "edge": levels.edge,
-            "low": levels.low,
-            "steps": config.bound_steps,
-            "cut": config.fit_cut,
-        }
+    if levels := config.cuts:
+        cuts = {"high": levels.high, "edge": levels.edge, "low": levels.low}
+        settings["interval"] = cuts | {"steps": config.bound_steps, "cut": config.fit_cut}
     return {
-        **({"local_ranges": digest(ranges.report())} if ranges else {}),
-        **({"rows": asdict(rows)} if rows else {}),
+        **({"local_ranges": digest(prepared.ranges.report())} if prepared.ranges else {}),
+        **({"rows": asdict(prepared.rows)} if prepared.rows else {}),
         **({"ground": _identity(prepared.ground)} if prepared.ground else {}),
         **_made_by(),
         "settings": settings,

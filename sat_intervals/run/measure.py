@@ -23,6 +23,7 @@ from sat_intervals.prepare.prepared import Prepared, prepare
 from sat_intervals.products import INVALID
 from sat_intervals.progress import Progress
 from sat_intervals.raster import BLOCK, Image, Layer, open_image
+from sat_intervals.raster.images import check_size
 from sat_intervals.run.assemble import scale_of
 from sat_intervals.run.checks import checked_pair, checked_region
 from sat_intervals.run.connection import Connection
@@ -59,11 +60,7 @@ class CalibrationScene:
 def truth_of(left: Image, path: str | Path) -> Layer:
     """Open the truth of a whole left image; raise if it has another size."""
     truth = open_image(path)
-    if (truth.height, truth.width) != (left.height, left.width):
-        raise SatIntervalsError(
-            f"{truth.path} has {truth.height} x {truth.width} pixels, {left.path} {left.height} x {left.width}: "
-            "give the truth of the left image"
-        )
+    check_size(truth.path, (truth.height, truth.width), left, "give the truth of the left image")
     return Layer(truth, 0, 0)
 
 
@@ -118,7 +115,8 @@ def _of_scene(
     progress: Progress,
 ) -> list[Measured]:
     """Match a scene, with two levels of the sweep at a time, and measure it."""
-    gauge: _SceneGauge | None = None
+    gauge = Gauge(thresholds, scene.group, scene.tolerance, in_blocks=in_blocks)
+    bias = None if scene.remove_bias else 0.0
     with ExitStack() as stack:
         pairs = pairs_of(thresholds)
         images = checked_pair(scene.left, scene.right, scene.config)
@@ -134,14 +132,16 @@ def _of_scene(
             if in_blocks and len(batches) > 1:  # stages of each batch would begin again
                 step = partial(_of_all, progress, "levels", number, len(batches))
             for matched in match_jobs(workers, batch, step):
-                job = matched.job
-                check_failures(job, matched.failures)
-                gauge = gauge or _SceneGauge(job, scene, thresholds, in_blocks)
-                gauge.add(job, pairs[jobs.index(job)])
+                check_failures(matched.job, matched.failures)
+                config = matched.job.config.model_copy(update={"refinement": scene.config.refinement})
+                job = replace(matched.job, prepared=replace(prepared, config=config))
+                bias = _found_bias(job, scene) if bias is None else bias
+                pair = pairs[jobs.index(matched.job)]
+                for strip, inner, scale, truth, blocks in _strips(job, scene):
+                    gauge.add(strip, inner, scale, (truth + bias, blocks * in_blocks), pair, config)
                 job.store.remove()
         check_unchanged(jobs[0].inputs, jobs[0].images, jobs[0].config)
-    assert gauge is not None  # there are jobs
-    return gauge.gauge.measured()
+    return gauge.measured()
 
 
 def _begun(
@@ -169,48 +169,26 @@ def _begun(
     return job
 
 
-class _SceneGauge:
-    """Measures the intervals of a scene, job by job."""
-
-    def __init__(self, job: Job, scene: CalibrationScene, thresholds: ThresholdSweep, in_blocks: bool) -> None:
-        self._scene, self._in_blocks = scene, in_blocks
-        region = job.store.grid.region
-        self._shape = region.height, region.width
-        self.gauge = Gauge(thresholds, scene.group, scene.tolerance, in_blocks=in_blocks)
-        self._bias = self._found_bias(job) if scene.remove_bias else 0.0
-
-    def _found_bias(self, job: Job) -> float:
-        histogram = bias_histogram()
-        config = self._config(job)
-        for row, strip, first, last, scale in _strips(job, config):
-            rows, truth = filter_rows(strip, scale, config), self._truth(row, last - first)
-            chosen = (rows.validity[first:last] & INVALID == 0) & np.isfinite(truth)
-            histogram.add(rows.disparity[first:last][chosen].astype(np.float64) - truth[chosen])
-        return histogram.median() or 0.0
-
-    def _truth(self, row: int, height: int) -> np.ndarray:
-        return self._scene.truth.read(Window(row, 0, height, self._shape[1]))
-
-    def add(self, job: Job, pair: tuple[int, int]) -> None:
-        """Measure a job, whose cuts are a pair of thresholds, see `pairs_of`."""
-        config = self._config(job)
-        for row, strip, first, last, scale in _strips(job, config):
-            truth, parts = self._truth(row, last - first) + self._bias, block_numbers(row, last - first, self._shape)
-            if not self._in_blocks:
-                parts[:] = 0
-            self.gauge.add(strip, slice(first, last), scale, (truth, parts), pair, config)
-
-    def _config(self, job: Job) -> Config:
-        return job.config.model_copy(update={"refinement": self._scene.config.refinement})
+def _found_bias(job: Job, scene: CalibrationScene) -> float:
+    """Return the median of disparity - truth of a matched scene."""
+    histogram = bias_histogram()
+    for strip, inner, scale, truth, _ in _strips(job, scene):
+        rows = filter_rows(strip, scale, job.config)
+        chosen = (rows.validity[inner] & INVALID == 0) & np.isfinite(truth)
+        histogram.add(rows.disparity[inner][chosen].astype(np.float64) - truth[chosen])
+    return histogram.median() or 0.0
 
 
-def _strips(job: Job, config: Config) -> Iterator[tuple[int, RawRows, int, int, ConfidenceScale]]:
-    """Yield first row of the region, raw rows with their halo, ``first`` and ``last`` of `with_halo`, and the scale."""
-    height = job.store.grid.region.height
+def _strips(
+    job: Job, scene: CalibrationScene
+) -> Iterator[tuple[RawRows, slice, ConfidenceScale, np.ndarray, np.ndarray]]:
+    """Yield raw rows with their halo, which of them are inside, the scale, and truth and blocks of those inside."""
+    height, width = shape = job.store.grid.region.height, job.store.grid.region.width
     scale = scale_of(job, job.store.tables())
     row = 0
     starts = range(0, height, BLOCK)
-    raw = (rows for start in starts for rows in raw_rows(job, config, start, min(height, start + BLOCK)))
-    for rows, first, last in with_halo(raw, halo(config)):
-        yield row, rows, first, last, scale
+    raw = (rows for start in starts for rows in raw_rows(job, start, min(height, start + BLOCK)))
+    for rows, first, last in with_halo(raw, halo(job.config)):
+        truth = scene.truth.read(Window(row, 0, last - first, width))
+        yield rows, slice(first, last), scale, truth, block_numbers(row, last - first, shape)
         row += last - first

@@ -19,7 +19,7 @@ from sat_intervals.run.beside import compiled_beside
 from sat_intervals.run.connection import Connection
 from sat_intervals.run.each import EachOnWorkers
 from sat_intervals.run.job import Job, open_job
-from sat_intervals.run.tile import match_block, trace_block
+from sat_intervals.run.tile import match_or_trace
 from sat_intervals.run.workers import Task, Workers, check_not_full, reason
 from sat_intervals.store.lock import locked
 from sat_intervals.store.tiles import BORDERS, COSTS, FAILURES, PIXELS, DamagedTilesError
@@ -120,14 +120,12 @@ def matched_on(
 
 def _named(config: Config, volume_of: VolumeOf | None) -> Config:
     """Return settings with the name of the function that makes volumes; raise if they ask for another cost."""
-    if not isinstance(config.cost, Volume):
-        if volume_of is not None:
-            raise ConfigError(f"volume_of is given, but cost.method is {config.cost.method}: give cost.method volume")
-        return config
-    if volume_of is not None and not callable(volume_of):
-        raise ConfigError(f"volume_of is {volume_of!r}: give the function that makes the volume of a tile")
     if volume_of is None:
         return config
+    if not isinstance(config.cost, Volume):
+        raise ConfigError(f"volume_of is given, but cost.method is {config.cost.method}: give cost.method volume")
+    if not callable(volume_of):
+        raise ConfigError(f"volume_of is {volume_of!r}: give the function that makes the volume of a tile")
     named = getattr(volume_of, "__qualname__", "<")  # neither an object nor what it holds has a name
     name = config.cost.name or f"{volume_of.__module__}.{named}"
     if "<" in name:
@@ -248,6 +246,4 @@ def _tasks(jobs: Sequence[Job], schedules: Sequence[Schedule]) -> Iterator[Task 
         if step is None:
             yield None
         else:
-            function = match_block if step.wavefront is None else trace_block
-            arguments = step if step.wavefront is not None else step[:1]
-            yield Task((i, step), function, (jobs[i], *arguments), jobs[i].config.cluster.retries)
+            yield Task((i, step), match_or_trace, (jobs[i], *step), jobs[i].config.cluster.retries)

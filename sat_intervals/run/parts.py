@@ -12,15 +12,17 @@ from typing import Any
 
 import numpy as np
 
+from sat_intervals.config import Cluster
 from sat_intervals.errors import RunError
 from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.match import postprocess, refinement
+from sat_intervals.prepare.pair import Rows
 from sat_intervals.progress import Progress
 from sat_intervals.raster import BLOCK, File, OutputWriter, Part, codec_versions, compressed, factors, halved
-from sat_intervals.run.workers import Task, Threads, Workers, picklable_errors, results
-from sat_intervals.store.arrays import DamagedFileError
+from sat_intervals.run.workers import Task, Threads, Workers, computing, results
 from sat_intervals.store.manifest import digest
-from sat_intervals.store.tiles import PARTS, DamagedTilesError, Store
+from sat_intervals.store.tiles import PARTS, Store
+from sat_intervals.tiling import Window
 
 PartKey = tuple[int, int]
 """Level of a file, 0 for its pixels, and row of blocks from the top."""
@@ -40,7 +42,7 @@ class Parts:
     shape: tuple[int, int]
     run: str
     codecs: dict[str, Any]
-    retries: int
+    cluster: Cluster
 
     @property
     def of(self) -> str:
@@ -60,13 +62,16 @@ class Parts:
                 "sat-intervals and rasterio for all"
             )
 
-    def damaged(self, names: Sequence[str]) -> DamagedTilesError:
-        """Delete parts; return the error that says that they must be made again."""
-        self.store.delete(PARTS, names)
-        return DamagedTilesError(
-            f"parts {', '.join(names)} in {self.store.folder} are damaged or missing: rerun the same command: it makes "
-            "them again"
-        )
+    def read(self, key: PartKey, names: Sequence[str]) -> list[np.ndarray]:
+        """Read arrays of a part; delete it and raise DamagedTilesError if it is damaged or missing."""
+        if (arrays := self.store.read(PARTS, part_name(key), names, self.of)) is None:
+            raise self.store.damaged(PARTS, [part_name(key)], self.of)
+        return arrays
+
+    def window(self, key: PartKey) -> Window:
+        """Return the pixels that a part is made of."""
+        level, row = key
+        return Window(BLOCK * row << level, 0, BLOCK << level, self.shape[1]).clipped(Window(0, 0, *self.shape))
 
 
 def codecs_of(files: Sequence[File]) -> dict[str, Any]:
@@ -83,20 +88,19 @@ def part_name(key: PartKey) -> str:
 def finish_parts(
     parts: Parts,
     workers: Workers,
-    row: Callable[[PartKey], tuple[Callable[..., str | None], tuple[Any, ...]]],
-    failed: Callable[[PartKey], str],
-    look: Callable[[int], None],
+    row: Callable[[Window], tuple[Callable[..., Rows], tuple[Any, ...]]],
+    failed: Callable[[Window], str],
+    stage: str,
+    progress: Progress,
 ) -> dict[PartKey, dict[str, Any]]:
     """Make the parts that are missing; return ``meta`` of all.
 
-    ``row`` returns function and arguments that write a row of blocks of the files and return None, or what is damaged;
-    ``look`` is given the number of rows of blocks done.
+    ``row`` returns function and arguments that make the rows of a window; ``failed`` says which could not be made.
     """
     counts, store, of = parts.rows, parts.store, parts.of
     keys = [(level, row) for level in reversed(range(len(counts))) for row in range(counts[level])]
     done = {key for key in keys if store.meta(PARTS, part_name(key), of)}
     waiting = [key for key in keys if key not in done]
-    damaged: list[str] = []
 
     def tasks() -> Iterator[Task | None]:
         while waiting:
@@ -105,22 +109,19 @@ def finish_parts(
                 yield None
             else:
                 waiting.remove(key)
-                function, arguments = (reduce_rows, (parts, key, _below(key, counts))) if key[0] else row(key)
-                yield Task(key, function, arguments, parts.retries)
+                below = _below(key, counts)
+                function, arguments = (reduce_rows, (parts, below)) if below else row(parts.window(key))
+                yield Task(key, make_part, (parts, key, function, arguments), parts.cluster.retries)
 
-    def looked(_: int) -> None:
-        look(sum(level == 0 for level, _ in done))
+    def look(_: int = 0) -> None:
+        progress(stage, min(parts.shape[0], BLOCK * sum(level == 0 for level, _ in done)), parts.shape[0])
 
-    for key, damage in results(workers, tasks(), failed, looked) if waiting else ():
-        if damage is None:
-            done.add(key)
-        else:
-            damaged.append(damage)  # the other strips are finished before tiles are matched again
-    if damaged:
-        raise DamagedTilesError(damaged[0])
+    look()
+    for key, _ in results(workers, tasks(), lambda key: failed(parts.window(key)), look) if waiting else ():
+        done.add(key)
     found = {key: meta for key in keys if (meta := store.meta(PARTS, part_name(key), of)) is not None}
     if missing := [part_name(key) for key in keys if key not in found]:
-        raise parts.damaged(missing)
+        raise store.damaged(PARTS, missing, of)
     return found
 
 
@@ -130,19 +131,20 @@ def _below(key: PartKey, counts: Sequence[int]) -> list[PartKey]:
     return [(level - 1, below) for below in (2 * row, 2 * row + 1) if level and below < counts[level - 1]]
 
 
-def reduce_rows(parts: Parts, key: PartKey, below: Sequence[PartKey]) -> str | None:
-    """Make a row of blocks of an overview from parts of the level below; return what is wrong if one is damaged."""
-    with picklable_errors():
+def make_part(parts: Parts, key: PartKey, function: Callable[..., Rows], arguments: tuple[Any, ...]) -> None:
+    """Make a part with a function; runs on a worker."""
+    # also while it reads and writes: more strips at once would need more memory than `check_tiles` allows for
+    with computing(parts.cluster):
         parts.check()
-        halves = []
-        for part in map(part_name, below):
-            try:
-                with parts.store.opened(PARTS, part, parts.of) as archive:
-                    halves.append([archive[_HALF.format(file.name)] for file in parts.files])
-            except DamagedFileError:
-                return str(parts.damaged([part]))
-        write_part(parts, key, [np.concatenate(of_file, axis=1) for of_file in zip(*halves, strict=True)])
-    return None
+        rasters, noted = function(*arguments)
+        write_part(parts, key, rasters, **noted)
+
+
+def reduce_rows(parts: Parts, below: Sequence[PartKey]) -> Rows:
+    """Make a row of blocks of an overview from parts of the level below."""
+    names = [_HALF.format(file.name) for file in parts.files]
+    halves = [parts.read(key, names) for key in below]
+    return [np.concatenate(of_file, axis=1) for of_file in zip(*halves, strict=True)], {}
 
 
 def write_part(parts: Parts, key: PartKey, rasters: list[np.ndarray], **meta: Any) -> None:
@@ -171,7 +173,7 @@ def copy_parts(
     progress: Progress,
 ) -> None:
     """Copy finished parts into the files, on workers that share their folder, else (None) in this process."""
-    copied: list[str | None] = []
+    copied: list[Any] = []
 
     def look(_: int) -> None:
         progress("files", len(copied), len(parts.files) * len(metas))
@@ -180,11 +182,11 @@ def copy_parts(
 
         def copy(final: Path, path: Path, of_file: Iterable[tuple[int, Part]]) -> None:
             tasks = (
-                Task(part.source, copy_part, (parts, *part.source, path.absolute(), offset), parts.retries)
+                Task(part.source, copy_part, (parts, *part.source, path.absolute(), offset), parts.cluster.retries)
                 for offset, part in of_file
             )
-            for _, name in results(copiers, tasks, lambda _: f"{final} could not be written", look):
-                copied.append(name)
+            for source, _ in results(copiers, tasks, lambda _: f"{final} could not be written", look):
+                copied.append(source)
 
         look(0)
         for file in parts.files:
@@ -192,24 +194,16 @@ def copy_parts(
                 [Part(metas[level, row]["blocks"][file.name], ((level, row), file.name)) for row in range(count)]
                 for level, count in enumerate(parts.rows)
             ]
-            writer.assemble(file.name, levels, partial(copy, writer.folder / file.name))
-    if damaged := sorted({name for name in copied if name}):
-        raise parts.damaged(damaged)
+            writer.assemble(file, levels, partial(copy, writer.folder / file.name))
 
 
-def copy_part(parts: Parts, key: PartKey, name: str, path: Path, offset: int) -> str | None:
-    """Write a part into a file at an offset; return its name if it is damaged or missing. Runs on a worker."""
-    with picklable_errors():
-        parts.check()
-        try:
-            with parts.store.opened(PARTS, part_name(key), parts.of) as archive:
-                content = archive[name]
-        except DamagedFileError:
-            return part_name(key)
-        # not for reading: NFS would write whole pages, over bytes of the neighbours
-        with open(os.open(path, os.O_WRONLY), "wb") as stream:
-            stream.seek(offset)
-            stream.write(content.data)
-            stream.flush()
-            os.fsync(stream.fileno())
-    return None
+def copy_part(parts: Parts, key: PartKey, name: str, path: Path, offset: int) -> None:
+    """Write a part into a file at an offset; runs on a worker."""
+    parts.check()
+    (content,) = parts.read(key, [name])
+    # not for reading: NFS would write whole pages, over bytes of the neighbours
+    with open(os.open(path, os.O_WRONLY), "wb") as stream:
+        stream.seek(offset)
+        stream.write(content.data)
+        stream.flush()
+        os.fsync(stream.fileno())

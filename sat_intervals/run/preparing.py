@@ -25,13 +25,9 @@ def prepared_here(
     left: Image, right: Image, config: Config, progress: Progress, *, measures_rows: bool = True
 ) -> Prepared[FilePair]:
     """Prepare a pair on this machine; row offsets stay."""
-    with Connection(Cluster(), Path()) as connection:
-        return _prepared(left, right, config, EachOnWorkers(connection, progress), measures_rows=measures_rows)
-
-
-def _prepared(left: Image, right: Image, config: Config, each: Each, *, measures_rows: bool) -> Prepared[FilePair]:
     config = config.model_copy(update={"rows": "none"})
-    return prepare(FilePair(left, right), config, each, measures_rows=measures_rows)
+    with Connection(Cluster(), Path()) as connection:
+        return prepare(FilePair(left, right), config, EachOnWorkers(connection, progress), measures_rows=measures_rows)
 
 
 def range_of_pair(
@@ -56,7 +52,7 @@ def compared_rows(left: Path, right: Path, each: Each) -> dict[str, Any]:
     """Return how far rows of a pair differ: ``text``, ``warnings`` (lines), ``search`` (range) and ``survey``."""
     text = "not compared: too few matches"
     try:
-        survey = _prepared(open_image(left), open_image(right), load_config(), each, measures_rows=True).survey
+        survey = prepare(FilePair(open_image(left), open_image(right)), load_config({"rows": "none"}), each).survey
     except NoRangeError as error:
         return {"text": text, "warnings": [str(error)], "search": None, "survey": None}
     assert survey is not None  # it was looked at

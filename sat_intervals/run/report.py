@@ -29,12 +29,11 @@ _COUNTS_MEANING = {
 def tags_of(job: Job) -> dict[str, str]:
     """Return the tags of the output files."""
     config = job.config
-    if job.swept:
-        return _tags_of_surface(job, job.swept)
-    tags = {
-        "SOFTWARE": f"sat-intervals {version('sat-intervals')}",
-        "SEARCH_RANGE": f"{config.disparity.minimum} {config.disparity.maximum}",
-    }
+    tags = {"SOFTWARE": f"sat-intervals {version('sat-intervals')}"}
+    if swept := job.swept:  # see `surface_tags`; the size of tiles is not in them
+        of = {"RUNS": swept.asked, "HEIGHTS": f"above {swept.level}"} | tags_of_sweep(config, len(job.images))
+        return tags | (swept.calibration.tagged(of, job.left.georeferencing.affine.a) if swept.calibration else of)
+    tags["SEARCH_RANGE"] = f"{config.disparity.minimum} {config.disparity.maximum}"
     interval = config.interval
     if interval and interval.coverage is not None:
         calibration = calibration_of(config)
@@ -43,14 +42,6 @@ def tags_of(job: Job) -> dict[str, str]:
     elif interval:
         tags["ALPHA"] = f"{interval.alpha} (level of possibility, not a probability)"
     return tags
-
-
-def _tags_of_surface(job: Job, swept: Swept) -> dict[str, str]:
-    """Return the tags of the surface of a sweep, see `surface_tags`; the size of tiles is not in them."""
-    software = {"SOFTWARE": f"sat-intervals {version('sat-intervals')}"}
-    tags = {"RUNS": swept.asked, "HEIGHTS": f"above {swept.level}"} | tags_of_sweep(job.config, len(job.images))
-    cell = job.left.georeferencing.affine.a
-    return software | (swept.calibration.tagged(tags, cell) if swept.calibration else tags)
 
 
 def _margins(swept: Swept) -> dict[str, Any] | None:

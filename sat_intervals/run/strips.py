@@ -1,11 +1,11 @@
 """Finish strips of a run on workers: final bands, as parts of the files."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
 
-from sat_intervals.config import Config, HeightCalibration
+from sat_intervals.config import HeightCalibration
 from sat_intervals.kernels.conformal import AROUND, Margins, relief_of
 from sat_intervals.match.around import with_agreement
 from sat_intervals.match.ground import GroundViews
@@ -22,80 +22,63 @@ from sat_intervals.match.postprocess import (
 from sat_intervals.match.refinement import pixel_windows, pixels_of
 from sat_intervals.match.statistics import Tally
 from sat_intervals.prepare.local import given_disparities
+from sat_intervals.prepare.pair import Rows
 from sat_intervals.products import SURFACE, Bands
 from sat_intervals.progress import Progress
-from sat_intervals.raster import BLOCK, read_views
+from sat_intervals.raster import read_views
 from sat_intervals.run.job import Job
-from sat_intervals.run.parts import PartKey, Parts, codecs_of, finish_parts, write_part
+from sat_intervals.run.parts import PartKey, Parts, codecs_of, finish_parts
 from sat_intervals.run.state import files_of_run
-from sat_intervals.run.workers import Workers, computing, picklable_errors
-from sat_intervals.store.tiles import DamagedTilesError
+from sat_intervals.run.workers import Workers
 from sat_intervals.tiling import Window
 
 
 def parts_of(job: Job) -> Parts:
     """Return the parts of the files of a run."""
     files, region = files_of_run(job.config), job.store.grid.region
-    return Parts(
-        job.store, files, (region.height, region.width), job.name, codecs_of(files), job.config.cluster.retries
-    )
+    return Parts(job.store, files, (region.height, region.width), job.name, codecs_of(files), job.config.cluster)
 
 
 def finish_strips(
     job: Job, parts: Parts, workers: Workers, scale: ConfidenceScale, progress: Progress
 ) -> dict[PartKey, dict[str, Any]]:
     """Make the parts of a run that are missing, once its tiles are done; return ``meta`` of all parts."""
-    height = parts.shape[0]
-
-    def look(rows: int) -> None:
-        progress("bands", min(height, BLOCK * rows), height)
-
-    def row(key: PartKey) -> tuple[Callable[..., str | None], tuple[Any, ...]]:
-        return finish_strip, (job, parts, key, scale)
-
-    def failed(key: PartKey) -> str:
-        first, last = (min(height, BLOCK * (there << key[0])) for there in (key[1], key[1] + 1))
-        return f"rows {first} to {last - 1} could not be finished"
-
-    found = finish_parts(parts, workers, row, failed, look)
-    progress("bands", height, height)
-    return found
+    return finish_parts(
+        parts,
+        workers,
+        lambda strip: (finish_strip, (job, strip, scale)),
+        lambda rows: f"rows {rows.row} to {rows.row_stop - 1} could not be finished",
+        "bands",
+        progress,
+    )
 
 
-def finish_strip(job: Job, parts: Parts, key: PartKey, scale: ConfidenceScale) -> str | None:
-    """Make the part of a strip; return what is wrong if tiles are damaged. Runs on a worker."""
-    # also while it reads and writes: more strips at once would need more memory than `check_tiles` allows for
-    with picklable_errors(), computing(job.config.cluster):
-        job.check_version()
-        parts.check()
-        region = job.store.grid.region
-        search = job.config.disparity
-        margin = halo(job.config) + (AROUND if job.swept and job.swept.calibration else 0)
-        first, last = key[1] * BLOCK, min(region.height, (key[1] + 1) * BLOCK)
-        top, bottom = max(0, first - margin), min(region.height, last + margin)
-        shape, extra = (last - first, region.width), () if job.swept else job.config.extra_bands
-        bands = len(SURFACE) if job.swept else 4 + len(extra)
-        intervals, validity = np.empty((bands, *shape), np.float32), np.empty((1, *shape), np.uint16)
-        given = given_disparities(job.config, Window(region.row + first, region.column, *shape))
-        tally, row = Tally(search.count, search.minimum), 0
-        counts = list[np.ndarray]()
-        try:
-            finals = postprocess_strips(raw_rows(job, job.config, top, bottom, counts), scale, job.config)
-            if job.swept and job.swept.calibration:
-                finals = _widened(finals, job.swept.calibration, job.ground())
-            for final in inner_rows(finals, first - top, shape[0]):
-                rows = slice(row, row := row + len(final.validity))
-                if given is not None:
-                    final = with_agreement(final, given[rows])
-                intervals[: 4 + len(extra), rows] = [*final[:4], *(getattr(final, name) for name in extra)]
-                validity[:, rows] = final.validity
-                tally.add(final)
-        except DamagedTilesError as error:
-            return str(error)
-        if job.swept:
-            _to_heights(intervals, np.concatenate(counts)[first - top :][: shape[0]], job.ground())
-        write_part(parts, key, [intervals, validity], counts=tally.counts())
-    return None
+def finish_strip(job: Job, strip: Window, scale: ConfidenceScale) -> Rows:
+    """Return the bands and the counts of a strip of the region; runs on a worker."""
+    job.check_version()
+    region = job.store.grid.region
+    search = job.config.disparity
+    margin = halo(job.config) + (AROUND if job.swept and job.swept.calibration else 0)
+    read = strip.grown(margin, 0).clipped(Window(0, 0, region.height, region.width))
+    shape, extra = (strip.height, strip.width), () if job.swept else job.config.extra_bands
+    bands = len(SURFACE) if job.swept else 4 + len(extra)
+    intervals, validity = np.empty((bands, *shape), np.float32), np.empty((1, *shape), np.uint16)
+    given = given_disparities(job.config, Window(region.row + strip.row, region.column, *shape))
+    tally, row = Tally(search.count, search.minimum), 0
+    counts = list[np.ndarray]()
+    finals = postprocess_strips(raw_rows(job, read.row, read.row_stop, counts), scale, job.config)
+    if job.swept and job.swept.calibration:
+        finals = _widened(finals, job.swept.calibration, job.ground())
+    for final in inner_rows(finals, strip.row - read.row, strip.height):
+        rows = slice(row, row := row + len(final.validity))
+        if given is not None:
+            final = with_agreement(final, given[rows])
+        intervals[: 4 + len(extra), rows] = [*final[:4], *(getattr(final, name) for name in extra)]
+        validity[:, rows] = final.validity
+        tally.add(final)
+    if job.swept:
+        _to_heights(intervals, np.concatenate(counts)[strip.row - read.row :][: strip.height], job.ground())
+    return [intervals, validity], {"counts": tally.counts()}
 
 
 def _widened(finals: Iterable[Bands], calibration: HeightCalibration, ground: GroundViews | None) -> Iterator[Bands]:
@@ -120,19 +103,17 @@ def _to_heights(bands: np.ndarray, count: np.ndarray, ground: GroundViews | None
         band[:] = ground.base + ground.step * band.astype(np.float64)
 
 
-def raw_rows(
-    job: Job, config: Config, first: int, last: int, counts: list[np.ndarray] | None = None
-) -> Iterator[RawRows]:
+def raw_rows(job: Job, first: int, last: int, counts: list[np.ndarray] | None = None) -> Iterator[RawRows]:
     """Yield raw products of the rows ``[first, last)`` of the region, with the pixels that the settings need.
 
     The images that see the cells of a sweep are appended to ``counts``.
     """
-    region, search = job.store.grid.region, config.disparity
+    region, config = job.store.grid.region, job.config
     if config.fits:
         window = Window(region.row + first, region.column, last - first, region.width)
         left, right = pixels_of(read_views((job.left, job.right), pixel_windows(window, config)))
     row = 0
-    for piece in job.store.strips(max(1, STRIP_PIXELS // region.width), search.count, first, last):
+    for piece in job.store.strips(max(1, STRIP_PIXELS // region.width), config.disparity.count, first, last):
         if (count := piece.pop("count", None)) is not None and counts is not None:
             counts.append(count)
         rows = RawRows(

@@ -1,14 +1,13 @@
 """Clusters of dask, and tasks on them, a bounded number at a time; dask repeats these and replaces lost workers."""
 
 import asyncio
-import itertools
 import logging
 import signal
 import time
 import uuid
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError, Future
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from sat_intervals.config import Cluster
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.machine import usable_cores
 from sat_intervals.run.batch_system import batch_system
-from sat_intervals.run.workers import CHECK_EVERY, Outcome, Task, in_flight, readers, reason
+from sat_intervals.run.workers import CHECK_EVERY, Outcome, Task, called, in_flight, readers, reason
 
 STARTING = 120.0  # seconds for local worker processes to start
 DASK = {
@@ -48,8 +47,6 @@ class DaskWorkers:
 
     def __init__(self, client: Client) -> None:
         self._client = client
-        self._run = uuid.uuid4().hex  # unique, since a scheduler may serve several runs
-        self._numbers = itertools.count()
         self._cores: dict[str, int] = {}
         self._checked = float("-inf")
         self._seen: float | None = None  # time of the last worker
@@ -95,9 +92,11 @@ class DaskWorkers:
             _LOG.warning("there is no worker yet%s", where)
 
     def _submit(self, task: Task) -> Future[Outcome]:
-        key = f"{task.function.__name__}-{self._run}-{next(self._numbers)}"
+        key = f"{task.function.__name__}-{uuid.uuid4().hex}"  # unique, since a scheduler may serve several runs
         with _scheduler_errors():
-            future = self._client.submit(task.function, *task.arguments, key=key, retries=task.retries, pure=False)
+            future = self._client.submit(
+                called, task.function, *task.arguments, key=key, retries=task.retries, pure=False
+            )
         loop: Any = self._client.loop
         return asyncio.run_coroutine_threadsafe(_outcome(task.label, future), loop.asyncio_loop)
 
@@ -146,14 +145,11 @@ def connected(settings: Cluster, out: Path) -> Iterator[Client]:
 @contextmanager
 def _silenced(names: Sequence[str]) -> Iterator[None]:
     """Keep lines of loggers away: after shareloc the root logger would print them."""
-    levels = {logging.getLogger(name): logging.getLogger(name).level for name in names}
-    try:
-        for logger in levels:
+    with ExitStack() as levels:
+        for logger in map(logging.getLogger, names):
+            levels.callback(logger.setLevel, logger.level)
             logger.setLevel(logging.CRITICAL)
         yield
-    finally:
-        for logger, level in levels.items():
-            logger.setLevel(level)
 
 
 def _ignore_interrupts() -> None:

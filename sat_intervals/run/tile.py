@@ -1,8 +1,7 @@
 """Match the tiles of a block on a worker, or trace its paths: read, compute, write the intermediate products."""
 
 import logging
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from sat_intervals.products import NO_DISPARITY
 from sat_intervals.progress import timed
 from sat_intervals.run.job import Job
 from sat_intervals.run.source import Source, costed, frame_of, read_source
-from sat_intervals.run.workers import computing, picklable_errors
+from sat_intervals.run.workers import computing
 from sat_intervals.store.arrays import numbered
 from sat_intervals.store.tiles import BORDERS
 from sat_intervals.tiling import Tile
@@ -28,39 +27,34 @@ Handed = dict[Place, list[Edge]]
 _LOG = logging.getLogger(__name__)
 
 
-def match_block(job: Job, block: Tile) -> None:
-    """Match the tiles of a block and write their intermediate products; runs on a worker."""
-    with _logged_failure(job, block.name), picklable_errors():
-        read: dict[str, float] = {}
-        tiles, ranges = job.store.grid.within(block.core), job.ranges()
-        source = read_source(job, block, ranges, read)
-        handed: list[Handed] = []
-        if job.hands_states_on:
-            with timed(read, "read"):
-                handed = [
-                    _handed(job, block, wavefront, inside=len(tiles) > 1 and wavefront != LAST)
-                    for wavefront in range(len(WAVEFRONTS))
-                ]
-            tiles = in_order(LAST, tiles)  # whose states come with the matched tiles
-        for tile in tiles:
-            _match_tile(job, tile, source, handed, ranges, {"read": read["read"] / len(tiles)})
-        if job.hands_states_on:
-            _write_states(job, block, LAST, handed[LAST])
-
-
-def trace_block(job: Job, block: Tile, wavefront: int) -> dict[str, float]:
-    """Write the path states that a block hands on in a wavefront; return seconds by stage; runs on a worker."""
-    with _logged_failure(job, f"{block.name}, wavefront {wavefront},"), picklable_errors():
-        return _trace_block(job, block, wavefront)
-
-
-@contextmanager
-def _logged_failure(job: Job, step: str) -> Iterator[None]:
+def match_or_trace(job: Job, block: Tile, wavefront: int | None) -> dict[str, float]:
+    """Match a block or, in a wavefront, trace its paths; return seconds by stage. Runs on a worker, logs a failure."""
     try:
-        yield
+        return match_block(job, block) if wavefront is None else trace_block(job, block, wavefront)
     except Exception:
+        step = block.name if wavefront is None else f"{block.name}, wavefront {wavefront},"
         _LOG.info("tile %s failed; it is tried again at most %d times", step, job.config.cluster.retries, exc_info=True)
         raise
+
+
+def match_block(job: Job, block: Tile) -> dict[str, float]:
+    """Match the tiles of a block and write their intermediate products, with the seconds of each."""
+    read: dict[str, float] = {}
+    tiles, ranges = job.store.grid.within(block.core), job.ranges()
+    source = read_source(job, block, ranges, read)
+    handed: list[Handed] = []
+    if job.hands_states_on:
+        with timed(read, "read"):
+            handed = [
+                _handed(job, block, wavefront, inside=len(tiles) > 1 and wavefront != LAST)
+                for wavefront in range(len(WAVEFRONTS))
+            ]
+        tiles = in_order(LAST, tiles)  # whose states come with the matched tiles
+    for tile in tiles:
+        _match_tile(job, tile, source, handed, ranges, {"read": read["read"] / len(tiles)})
+    if job.hands_states_on:
+        _write_states(job, block, LAST, handed[LAST])
+    return {}
 
 
 def _match_tile(
@@ -90,7 +84,8 @@ def _match_tile(
     _LOG.debug("tile %s: %s", tile.name, ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items()))
 
 
-def _trace_block(job: Job, block: Tile, wavefront: int) -> dict[str, float]:
+def trace_block(job: Job, block: Tile, wavefront: int) -> dict[str, float]:
+    """Write the path states that a block hands on in a wavefront; return seconds by stage."""
     seconds: dict[str, float] = {}
     with timed(seconds, "trace"):
         tiles, ranges = job.store.grid.within(block.core), job.ranges()
@@ -152,7 +147,7 @@ def _states_of(job: Job, step: Step, wanted: Sequence[int]) -> list[list[Edge]]:
     if arrays is None:
         assert step.wavefront is not None
         _LOG.warning("%s is missing or damaged: it is traced again", file)
-        _trace_block(job, step.block, step.wavefront)
+        trace_block(job, step.block, step.wavefront)
         arrays = job.store.read(BORDERS, step.name, numbers)
     if arrays is None:
         raise RunError(

@@ -4,7 +4,7 @@ import errno
 import logging
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import cache
 from queue import Empty, SimpleQueue
@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol
 from sat_intervals.config import Cluster, ConfigError
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.machine import usable_cores
+from sat_intervals.store.tiles import DamagedTilesError
 
 CHECK_EVERY = 2.0  # seconds after which the caller is asked for more tasks, if no task has ended
 _FULL_DISK = errno.ENOSPC, errno.EDQUOT
@@ -53,11 +54,17 @@ def results(
     failed: Callable[[Any], str],
     look: Callable[[int], None],
 ) -> Iterator[tuple[Any, Any]]:
-    """Yield label and result of each task; ``failed`` says which one failed, ``look`` is given the number done."""
-    done = 0
+    """Yield label and result of each task; ``failed`` says which one failed, ``look`` is given the number done.
+
+    Where files are damaged the other tasks are done before the error.
+    """
+    done, damaged = 0, list[DamagedTilesError]()
     for outcome in workers.outcomes(tasks):
         if outcome is not None:
-            if (error := outcome.error) is not None:
+            if isinstance(error := outcome.error, DamagedTilesError):
+                damaged.append(error)
+                continue
+            if error is not None:
                 if isinstance(error, SatIntervalsError):  # names files and the way out
                     raise error
                 check_not_full(error, what := failed(outcome.label))
@@ -65,6 +72,8 @@ def results(
             done += 1
             yield outcome.label, outcome.result
         look(done)
+    if damaged:
+        raise damaged[0]
 
 
 def readers(settings: Cluster) -> int:
@@ -138,7 +147,7 @@ def _tried(task: Task) -> Outcome:
     tries = 0
     while True:
         try:
-            return Outcome(task.label, task.function(*task.arguments), None)
+            return Outcome(task.label, called(task.function, *task.arguments), None)
         except Exception as error:
             tries += 1
             if tries > task.retries:
@@ -174,11 +183,10 @@ def check_not_full(error: BaseException, place: object) -> None:
         ) from error
 
 
-@contextmanager
-def picklable_errors() -> Iterator[None]:
-    """Drop the causes of our errors: those of GDAL cannot be sent from a worker."""
+def called(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call the function of a task; drop the causes of our errors: those of GDAL cannot be sent from a worker."""
     try:
-        yield
+        return function(*arguments)
     except SatIntervalsError as error:
         error.__cause__ = error.__context__ = None
         raise

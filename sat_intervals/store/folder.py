@@ -2,11 +2,11 @@
 
 import os
 import uuid
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import Any
 
 from sat_intervals.store.remote import opened_at, reached
 
@@ -32,12 +32,10 @@ class Folder:
     def _path(self, name: str) -> str:
         return f"{self.place}/{name}"
 
-    @contextmanager
-    def opened(self, name: str) -> Iterator[IO[bytes]]:
+    def opened(self, name: str) -> Any:
         """Open a file for reading any part of it."""
         path = self._path(name)
-        with open(path, "rb") if self.is_local else opened_at(path) as stream:
-            yield stream
+        return open(path, "rb") if self.is_local else opened_at(path)
 
     def write(self, name: str, content: bytes | memoryview, *, is_flushed: bool = False) -> None:
         """Write a file that exists only when it is complete; ``is_flushed``: also after a power loss."""

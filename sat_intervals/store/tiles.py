@@ -59,10 +59,10 @@ class Store:
         """Open a file for reading; see `unpacked`."""
         return unpacked(self.folder, f"{kind}/{name}.npz", of or self.run)
 
-    def read(self, kind: str, name: str, wanted: Collection[str] | None = None) -> list[np.ndarray] | None:
-        """Read all arrays of a file, or the ``wanted`` ones; None if it is missing or damaged."""
-        with suppress(DamagedFileError), self.opened(kind, name) as archive:
-            return [archive[key].copy() for key in (archive.names() if wanted is None else wanted)]
+    def read(self, kind: str, name: str, wanted: Collection[str] = (), of: str = "") -> list[np.ndarray] | None:
+        """Read all arrays of a file, or the ``wanted`` ones if any; None if it is missing or damaged."""
+        with suppress(DamagedFileError), self.opened(kind, name, of) as archive:
+            return [archive[key].copy() for key in wanted or archive.names()]
         return None
 
     def meta(self, kind: str, name: str, of: str = "") -> dict[str, Any] | None:
@@ -85,9 +85,9 @@ class Store:
             self.folder.remove(kind)
         self.folder.remove_if_empty()
 
-    def is_intact(self, kind: str, name: str) -> bool:
+    def is_intact(self, kind: str, name: str, of: str = "") -> bool:
         """Return whether a file is there and all of it agrees with its checksums."""
-        with suppress(DamagedFileError), self.opened(kind, name) as archive:
+        with suppress(DamagedFileError), self.opened(kind, name, of) as archive:
             return archive.is_intact()
         return False
 
@@ -117,7 +117,7 @@ class Store:
                     records[tile.name] = archive.meta
                     histogram = histogram + archive["histogram"].astype(np.int64)
         except DamagedFileError as error:
-            raise self.damaged(self.grid) from error
+            raise self.damaged(TILES, (tile.name for tile in self.grid)) from error
         return Tables(histogram, records)
 
     def strips(self, rows: int, count: int, first: int = 0, last: int | None = None) -> Iterator[dict[str, np.ndarray]]:
@@ -132,7 +132,7 @@ class Store:
             try:
                 yield self._strip(top, bottom, count)
             except DamagedFileError as error:
-                raise self.damaged(self._tiles(top, bottom)) from error
+                raise self.damaged(TILES, (tile.name for tile in self._tiles(top, bottom))) from error
 
     def _tiles(self, top: int, bottom: int) -> list[Tile]:
         """Return the tiles of some rows of the region."""
@@ -160,12 +160,13 @@ class Store:
                     here[...] = np.minimum(here, rows) if name == "right" else rows
         return strip | {"right_winner": _winner(best)}
 
-    def damaged(self, tiles: Iterable[Tile]) -> DamagedTilesError:
-        """Delete those of some tiles that are damaged; return the error that names them."""
-        names = [tile.name for tile in tiles if not self.is_intact(TILES, tile.name)]
-        self.delete(TILES, names)
+    def damaged(self, kind: str, names: Iterable[str], of: str = "") -> DamagedTilesError:
+        """Delete those of some files that are damaged; return the error that names them."""
+        names = [name for name in names if not self.is_intact(kind, name, of)]
+        self.delete(kind, names)
+        does = "matches" if kind == TILES else "makes"
         return DamagedTilesError(
-            f"tiles {', '.join(names)} in {self.folder} are damaged or missing: rerun the same command: it matches "
+            f"{kind} {', '.join(names)} in {self.folder} are damaged or missing: rerun the same command: it {does} "
             "them again"
         )
 

@@ -319,7 +319,7 @@ def test_make_surface__does_not_depend_on_its_tiles(tmp_path, monkeypatch):
     monkeypatch.setattr("sat_intervals.heights.lattice.WINDOW", 7)
     monkeypatch.setattr("sat_intervals.heights.point_cloud.WINDOW", 5)
     monkeypatch.setattr("sat_intervals.heights.cells._TILE", 20)
-    for name in ("run.parts", "run.each", "raster.blocks", "raster.cog"):
+    for name in ("run.parts", "raster.blocks", "raster.cog"):
         monkeypatch.setattr(f"sat_intervals.{name}.BLOCK", 16)
     tiled, same_place, _ = surface_of([out], tmp_path, choices=choices)
     assert place == same_place

@@ -15,7 +15,7 @@ from sat_intervals import RunError, Window, match_pair
 from sat_intervals.demo import make_scene
 from sat_intervals.match import schedule
 from sat_intervals.raster import write_layer
-from sat_intervals.run import pair as run
+from sat_intervals.run import tile
 from sat_intervals.store.tiles import Store
 
 SETTINGS = {
@@ -90,7 +90,7 @@ def test_match_pair__names_the_wavefront_that_cannot_be_traced(folder, tmp_path,
     def fail(job, block, wavefront):
         raise RunError("no reason")
 
-    monkeypatch.setattr(run, "trace_block", fail)
+    monkeypatch.setattr(tile, "trace_block", fail)
     with pytest.raises(RunError, match="tile 0_0: tracing its path states, wavefront 0: no reason"):
         match(folder, tmp_path / "out", 64, {})
 

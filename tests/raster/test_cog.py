@@ -121,8 +121,7 @@ def test_assemble__has_the_tags_of_gdals_own_driver(tmp_path):
     write(tmp_path / "ours.tif", bands, VALIDITY, place)
     options = {"count": 1, "dtype": "uint16", **place.creation_options()}
     with rasterio.open(tmp_path / "plain.tif", "w", driver="GTiff", height=600, width=700, **options) as plain:
-        plain.update_tags(ALPHA="0.9")
-        VALIDITY.describe(plain)
+        VALIDITY.describe(plain, {"ALPHA": "0.9"})
         plain.write(bands)
     driver = {"driver": "COG", "compress": "DEFLATE", "overview_resampling": "NEAREST"}
     rasterio.shutil.copy(tmp_path / "plain.tif", tmp_path / "theirs.tif", **driver)
@@ -138,9 +137,9 @@ def test_assemble__has_the_tags_of_gdals_own_driver(tmp_path):
 @pytest.mark.parametrize("rows", [100, 512, 1100])
 def test_stream__makes_the_parts_of_any_strips(tmp_path, rows):
     bands = noise(INTERVALS, 1100, 40)
-    stream = Stream(INTERVALS, tmp_path, bands.shape[1:], 2)
+    stream = Stream(INTERVALS, tmp_path, bands.shape[1:])
     for row in range(0, 1100, rows):
-        stream.write(row, bands[:, row : row + rows])
+        stream.write(bands[:, row : row + rows])
     expected = parts_of(bands, INTERVALS)
     for found, wanted in zip(stream.parts, expected, strict=True):
         assert [part.sizes for part in found] == [part.sizes for part in wanted]

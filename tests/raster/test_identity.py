@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-from helpers import COMMAND, OUTPUTS, PLACE, hashes
+from helpers import COMMAND, OUTPUTS, PLACE, ended, hashes
 
 from sat_intervals import match_pair
 from sat_intervals.demo import make_scene
@@ -65,11 +65,6 @@ def match(server: ThreadingHTTPServer, out: Path, *options: str, prefix: str = "
     command = [COMMAND, "match", f"{address}/left.tif", f"{address}/right.tif", out, "--disparity", "-18", "40"]
     command += ["--set", "tiles.overlap=20", "--quiet", *options]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-
-
-def ended(process: subprocess.Popen) -> tuple[int, str]:
-    output, _ = process.communicate(timeout=60)
-    return process.returncode, output
 
 
 @pytest.mark.parametrize("prefix", ["", "/vsicurl/"])

@@ -460,7 +460,7 @@ def products() -> tuple[np.ndarray, np.ndarray]:
 
 def produce(folder: Path, products, *, where=None, rows=256, tags=None, publish=True) -> None:
     intervals, validity = products
-    with OutputWriter(folder, RUN_FILES, *validity.shape, where or Georeferencing(), tags or {}, threads=2) as output:
+    with OutputWriter(folder, RUN_FILES, *validity.shape, where or Georeferencing(), tags or {}) as output:
         for row in range(0, len(validity), rows):
             output.write(row, intervals[:, row : row + rows], validity[row : row + rows])
         if publish:

@@ -15,7 +15,7 @@ from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.products import INVALID
 from sat_intervals.results import open_run
-from sat_intervals.run import pair as run
+from sat_intervals.run import tile
 from sat_intervals.run.job import open_job
 from sat_intervals.run.tile import match_block
 from sat_intervals.store.manifest import differences, digest
@@ -113,14 +113,14 @@ def test_match_pair__goes_on_from_the_tiles_that_are_done(pair, tmp_path, monkey
     match_pair(left, right, tmp_path / "undisturbed", settings)
     log = tmp_path / "log"
 
-    def fail_once(job, tile):
+    def fail_once(job, block):
         with log.open("a") as file:
-            print(tile.name, file=file)
-        if tile.name == "1_2" and log.read_text().split().count("1_2") <= 3:
+            print(block.name, file=file)
+        if block.name == "1_2" and log.read_text().split().count("1_2") <= 3:
             raise OSError("disk gone")
-        return match_block(job, tile)
+        return match_block(job, block)
 
-    monkeypatch.setattr(run, "match_block", fail_once)
+    monkeypatch.setattr(tile, "match_block", fail_once)
     with pytest.raises(RunError, match=r"1 of 6 tiles failed.*\n.*tile 1_2: disk gone"):
         match_pair(left, right, tmp_path / "out", settings)
     assert not list((tmp_path / "out").glob("[a-z]*.*"))

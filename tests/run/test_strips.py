@@ -2,7 +2,6 @@
 
 import errno
 import shutil
-import subprocess
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 import psutil
 import pytest
 import rasterio
-from helpers import COMMAND, LOCK, OUTPUTS, PLACE, hashes, invoke, wait_until, write_pair
+from helpers import LOCK, OUTPUTS, PLACE, ended, hashes, invoke, started, wait_until, write_pair
 
 import sat_intervals
 from sat_intervals.config import Cluster, load_config
@@ -100,10 +99,10 @@ def test_finish_strips__gives_the_same_bytes_for_all_workers_and_tiles(tall, tmp
 def test_finish_strips__goes_on_from_the_parts_that_are_done(tall, tmp_path, monkeypatch):
     out = with_tiles(tall, tmp_path / "out")
 
-    def fail(job, of, place, *rest):
-        if place == (0, 2):
+    def fail(job, strip, scale):
+        if strip.row == 2 * BLOCK:
             raise OSError("disk gone")
-        return finish(job, of, place, *rest)
+        return finish(job, strip, scale)
 
     finish = strips.finish_strip
     with monkeypatch.context() as patch:
@@ -151,10 +150,10 @@ def test_finish_strips__with_zstd(tall, tmp_path):
             assert file.tags() == kept.tags()
 
 
-def test_finish_strip__refuses_a_worker_with_other_codecs(tall, tmp_path, monkeypatch):
+def test_make_part__refuses_a_worker_with_other_codecs(tall, tmp_path, monkeypatch):
     out = with_tiles(tall, tmp_path / "out")
-    finish = strips.finish_strip
-    monkeypatch.setattr(strips, "finish_strip", lambda job, parts, *rest: finish(job, replace(parts, codecs={}), *rest))
+    make = parts_of_files.make_part
+    monkeypatch.setattr(parts_of_files, "make_part", lambda parts, *rest: make(replace(parts, codecs={}), *rest))
     with pytest.raises(RunError, match=r"this worker compresses with .*'gdal'.*install the same versions of"):
         matched(tall, out)
     assert not parts(out)
@@ -255,8 +254,10 @@ def test_status__counts_strips(tall, tmp_path, monkeypatch):
     out = with_tiles(tall, tmp_path / "out")
     finish = strips.finish_strip
 
-    def first_only(job, codecs, key, *rest):
-        return finish(job, codecs, key, *rest) if key == (0, 0) else "not made"
+    def first_only(job, strip, scale):
+        if strip.row:
+            raise DamagedTilesError("not made")
+        return finish(job, strip, scale)
 
     monkeypatch.setattr(strips, "finish_strip", first_only)
     with pytest.raises(DamagedTilesError):
@@ -265,34 +266,18 @@ def test_status__counts_strips(tall, tmp_path, monkeypatch):
     assert "5 of 5 tiles done, 0 failed, 0 left, 1 of 4 strips done; no run is active" in result.output
 
 
-class Second:
-    """``sat-intervals match`` as a process, from tiles that are all done."""
-
-    def __init__(self, tall, out: Path, *options: str) -> None:
-        folder = tall[0]
-        command = [COMMAND, "match", folder / "left.tif", folder / "right.tif", out, "--quiet"]
-        command += ["--config", folder / "settings.yaml", *options]
-        self.process = subprocess.Popen(list(map(str, command)), stdout=subprocess.DEVNULL)
-
-    def __enter__(self):
-        return self.process
-
-    def __exit__(self, *error) -> None:
-        self.process.kill()
-        self.process.wait()
-
-
 @pytest.mark.process
 @pytest.mark.parametrize("cluster", ["threads", "processes"])
 def test_match__goes_on_after_kill_9_in_every_stage_of_its_second_half(tall, tmp_path, cluster):
-    out = with_tiles(tall, tmp_path / "out")
+    folder, out = tall[0], with_tiles(tall, tmp_path / "out")
+    command = "match", folder / "left.tif", folder / "right.tif", out, "--config", folder / "settings.yaml"
     seen: dict[str, int] = {}
     for count in (1, 4, PARTS, "file"):
 
         def reached(count=count):
             return list(out.glob(".validity.tif.part")) if count == "file" else len(parts(out)) >= count
 
-        with Second(tall, out, "--cluster", cluster) as process:
+        with started(*command, "--cluster", cluster) as process:
             wait_until(lambda: reached() or process.poll() is not None, f"{count}")
             children = psutil.Process(process.pid).children() if process.poll() is None else []
             process.kill()
@@ -304,7 +289,7 @@ def test_match__goes_on_after_kill_9_in_every_stage_of_its_second_half(tall, tmp
         now = parts(out)
         assert {name: now[name] for name in seen} == seen, "done twice"
         seen = now
-    with Second(tall, out, "--cluster", cluster) as process:
-        assert process.wait(60) == 0
+    with started(*command, "--cluster", cluster) as process:
+        assert ended(process, 60)[0] == 0
     assert hashes(out) == hashes(tall[0] / "kept")
     assert sorted(path.name for path in out.iterdir()) == [LOCK, *OUTPUTS]

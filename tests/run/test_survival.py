@@ -22,6 +22,7 @@ from helpers import COMMAND, OUTPUTS, PATIENCE, PLACE, invoke, wait_until
 from sat_intervals.demo import make_scene
 from sat_intervals.raster import BLOCK, read_layers, write_layer
 from sat_intervals.run import pair as run
+from sat_intervals.run import tile
 from sat_intervals.run.job import open_job
 from sat_intervals.run.submit import DaskWorkers
 from sat_intervals.store.lock import locked
@@ -297,8 +298,8 @@ def test_match_jobs__keeps_few_tiles_in_flight_however_many_there_are(pair, tmp_
     def record_only(job, block):
         job.store.write("tiles", block.name)
 
-    monkeypatch.setattr(run, "match_block", record_only)
-    monkeypatch.setattr(run, "trace_block", lambda *step: {})
+    monkeypatch.setattr(tile, "match_block", record_only)
+    monkeypatch.setattr(tile, "trace_block", lambda *step: {})
     futures, known = [], []
     image = tmp_path / "wide.tif"
     write_layer(image, np.ones((64 * 40, 64 * 50), np.uint16), 0, PLACE)

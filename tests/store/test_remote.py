@@ -5,7 +5,7 @@ import os
 import re
 import subprocess
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 from tempfile import gettempdir
@@ -13,7 +13,7 @@ from tempfile import gettempdir
 import numpy as np
 import psutil
 import pytest
-from helpers import COMMAND, OUTPUTS, PATIENCE, hashes, invoke, refused, wait_until, write_pair
+from helpers import COMMAND, LOCK, OUTPUTS, PATIENCE, ended, hashes, invoke, refused, started, wait_until, write_pair
 from rasterio.shutil import copy
 from raw import raw_pair
 from services.s3 import away_from
@@ -28,7 +28,6 @@ from sat_intervals.workflows.demo import write_views
 from sat_intervals.workflows.surface import surface
 
 TILES = 16
-LOCK = ".sat-intervals.lock"
 
 
 def s3():
@@ -47,21 +46,10 @@ def pair(tmp_path_factory) -> Path:
     return folder
 
 
-@contextmanager
-def started(pair: Path, out: Path, store: str | Path, *options: str) -> Iterator[subprocess.Popen]:
-    """``match`` as a process of its own that does not outlive the test."""
-    command = [COMMAND, "match", pair / "left.tif", pair / "right.tif", out, "--config", pair / "settings.yaml"]
-    command += ["--set", f"cluster.store={store}", "--quiet", *options]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
-
-
-def ended(process: subprocess.Popen) -> tuple[int, str]:
-    output, _ = process.communicate(timeout=PATIENCE)
-    return process.returncode, output
+def matching(pair: Path, out: Path, store: str | Path, *options: str) -> AbstractContextManager[subprocess.Popen]:
+    """``match`` as a process, see `started`."""
+    files = pair / "left.tif", pair / "right.tif", out, "--config", pair / "settings.yaml"
+    return started("match", *files, "--set", f"cluster.store={store}", *options)
 
 
 def objects(store: str) -> dict[str, datetime]:
@@ -108,13 +96,13 @@ def status_of(out: Path) -> str:
 
 def test_match__in_a_bucket_goes_on_after_kill_9(bucket, pair, tmp_path):
     store, out = f"{bucket}/killed", tmp_path / "out"
-    with started(pair, out, store, "--cluster", "processes", "--workers", "2") as first:
+    with matching(pair, out, store, "--cluster", "processes", "--workers", "2") as first:
         wait_for_tiles(first, store, 3)
         with halted(first):
             assert "a run is active" in status_of(out)
     done = records(store)
     assert f"{len(done)} of {TILES} tiles done, 0 failed, {TILES - len(done)} left; no run" in status_of(out)
-    with started(pair, out, store, "--keep-tiles") as again:
+    with matching(pair, out, store, "--keep-tiles") as again:
         assert ended(again) == (0, "")
     after = records(store)
     assert {name: after[name] for name in done} == done, "tiles done twice"
@@ -167,7 +155,7 @@ def test_stat__has_the_time_of_a_store_that_names_it_otherwise(tmp_path):
     ],
 )
 def test_match__refuses_a_store_that_cannot_be_used(bucket, pair, tmp_path, store, says):
-    with started(pair, tmp_path / "out", store) as process:
+    with matching(pair, tmp_path / "out", store) as process:
         status, output = ended(process)
     assert status == 2
     assert re.match(rf"sat-intervals: {store}/\w{{32}} cannot be used: {says}", output)
@@ -268,11 +256,11 @@ def test_match__publishes_whole_files_alone_while_the_server_is_away_and_resumes
     for request, kept in requests.items():
         with away_from(request) as address, monkeypatch.context() as patch:
             patch.setenv("AWS_ENDPOINT_URL", address)
-            ended = subprocess.run(
+            result = subprocess.run(
                 [*command, "--quiet", "--set", "cluster.retries=0"], capture_output=True, text=True, timeout=PATIENCE
             )
-        assert (ended.returncode, ended.stdout, ended.stderr.count("\n")) == (1, "", 1), ended.stderr
-        assert "rerun the same command" in ended.stderr
+        assert (result.returncode, result.stdout, result.stderr.count("\n")) == (1, "", 1), result.stderr
+        assert "rerun the same command" in result.stderr
         assert contents(out).keys() == kept
     done = records(out)
     assert len(done) == TILES
