@@ -7,7 +7,7 @@ import click
 
 from sat_intervals.cli import options
 from sat_intervals.cli.calibrate_dsm import calibrate_heights
-from sat_intervals.cli.matching import SettingsArguments, unlevelled_options
+from sat_intervals.cli.matching import SettingsArguments, options_without_levels
 
 
 @click.command(cls=options.Grouped, short_help="Find what intervals need for a coverage, with a truth.")
@@ -31,7 +31,7 @@ from sat_intervals.cli.matching import SettingsArguments, unlevelled_options
     metavar="C",
     help="With --dsm: coverage that the margins must reach, .5 to .99; default: the coverage of the runs.",
 )
-@unlevelled_options
+@options_without_levels
 def calibrate(
     pairs: tuple[Path, ...],
     output: Path,

@@ -202,7 +202,7 @@ def _named(settings: tuple[str, ...]) -> dict[str, Any]:
 
 # The command gets ``settings``: of workers alone, of all but levels, of all, or of all with the search range.
 cluster_options = gathered("settings", _settings, _CONFIG_OPTION, *_WORKER_OPTIONS)
-unlevelled_options = gathered("settings", _settings, _CONFIG_OPTION, _PRESET_OPTION, *_OTHER_OPTIONS)
+options_without_levels = gathered("settings", _settings, _CONFIG_OPTION, _PRESET_OPTION, *_OTHER_OPTIONS)
 _ALL = _CONFIG_OPTION, _PRESET_OPTION, *_LEVEL_OPTIONS, *_OTHER_OPTIONS
 settings_options = gathered("settings", _settings, *_ALL)
 search_options = gathered("settings", _settings, *_SEARCH_OPTIONS, *_ALL)

@@ -156,7 +156,7 @@ def note_geometry(outs: Sequence[Path], sensor_files: Sequence[SensorFiles]) -> 
 
 @dataclass(frozen=True)
 class Surface:
-    """A surface model, reference heights to compare it with, and ``how``, further arguments of `evaluate_surface`."""
+    """A surface model, reference heights to compare it with, and ``how``, how they are compared."""
 
     dsm: Path
     reference: Path

@@ -62,7 +62,7 @@ def results(
     for outcome in workers.outcomes(tasks):
         if outcome is not None:
             if isinstance(error := outcome.error, DamagedTilesError):
-                damaged.append(error)
+                damaged.append(error.with_traceback(None))  # its frames hold arrays of a strip
                 continue
             if error is not None:
                 if isinstance(error, SatIntervalsError):  # names files and the way out
@@ -150,7 +150,7 @@ def _tried(task: Task) -> Outcome:
             return Outcome(task.label, called(task.function, *task.arguments), None)
         except Exception as error:
             tries += 1
-            if tries > task.retries:
+            if tries > task.retries or isinstance(error, DamagedTilesError):  # which are deleted
                 return Outcome(task.label, None, error)
             _LOG.debug("%s of %s is tried again", task.function.__name__, task.label)
 

@@ -164,9 +164,9 @@ class Store:
         """Delete those of some files that are damaged; return the error that names them."""
         names = [name for name in names if not self.is_intact(kind, name, of)]
         self.delete(kind, names)
-        does = "matches" if kind == TILES else "makes"
+        verb = "matches" if kind == TILES else "makes"
         return DamagedTilesError(
-            f"{kind} {', '.join(names)} in {self.folder} are damaged or missing: rerun the same command: it {does} "
+            f"{kind} {', '.join(names)} in {self.folder} are damaged or missing: rerun the same command: it {verb} "
             "them again"
         )
 

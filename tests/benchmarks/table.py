@@ -232,22 +232,39 @@ def heights(folder, size=3000):
         row(f"`{name}`", f"{seconds / size**2 * 1e6:.2f}", f"{seconds / match:.2f}")
 
 
-def with_coverage(folder):
-    """Processor time with a coverage over that with alpha, of runs in turn, since other work changes the speed."""
+# Options without a setting, and with it.
+SETTINGS = {
+    "`satellite` instead of `paper`": (("--preset", "paper"), ("--preset", "satellite")),
+    "least squares instead of V-fit, with alpha": [
+        ("--alpha", 0.9, "--set", f"refinement.method={method}") for method in ("vfit", "least_squares")
+    ],
+    "a coverage instead of alpha, `satellite`": (("--alpha", 0.9), ("--coverage", 0.9)),
+    "a coverage instead of alpha, `paper`": [("--preset", "paper", level, 0.9) for level in ("--alpha", "--coverage")],
+    "`satellite-mccnn` instead of `satellite`": ((), ("--preset", "satellite-mccnn")),
+    "`mccnn` instead of `paper`": [("--preset", name) for name in ("paper", "mccnn")],
+    "`cross_check.method: accurate`": ((), ("--set", "cross_check.method=accurate")),
+    "`products.compression: zstd`": ((), ("--set", "products.compression=zstd")),
+}
+
+
+def settings(folder):
+    """Processor time with a setting over that without, of runs in turn, since other work changes the speed."""
     print()
-    row("with a coverage against alpha, processor time, median of pairs of runs", "ratio", "all")
-    row("---", "---", "---")
+    row("2000 x 2000 x 64, one worker, median of pairs of runs", "processor time", "all", "bytes of files")
+    row(*["---"] * 4)
     pair, out = write_pair(folder, 2000), folder / "out"
-    for preset in ("paper", "satellite"):
-        options = [("--preset", preset, level, 0.9) for level in ("--alpha", "--coverage")]
-        for more in options:
+    for name, sides in SETTINGS.items():
+        for more in sides:
             match(pair, out, 1, more=more)  # not counted
         ratios = []
-        for _ in range(7):
-            alpha, coverage = (match(pair, out, 1, more=more)[2] for more in options)
-            ratios.append(coverage / alpha)
-        least, most = min(ratios), max(ratios)
-        row(f"2000 x 2000, {preset}", f"{statistics.median(ratios):.2f}", f"{least:.2f} to {most:.2f}")
+        for _ in range(RUNS):
+            seconds, sizes = [], []
+            for more in sides:
+                seconds.append(match(pair, out, 1, more=more)[2])
+                sizes.append(sum(file.stat().st_size for file in out.glob("*.tif")))
+            ratios.append(seconds[1] / seconds[0])
+        range_of = f"{min(ratios):.2f} to {max(ratios):.2f}"
+        row(name, f"{statistics.median(ratios):.2f}", range_of, f"{sizes[1] / sizes[0]:.2f}")
 
 
 def main():
@@ -260,7 +277,7 @@ def main():
             "memory": in_memory,
             "mccnn": mccnn,
             "files": partial(file_to_file, Path(folder)),
-            "coverage": partial(with_coverage, Path(folder)),
+            "settings": partial(settings, Path(folder)),
             "heights": partial(heights, Path(folder)),
         }
         for name in sys.argv[1:] or parts:
