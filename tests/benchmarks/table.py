@@ -242,7 +242,9 @@ SETTINGS = {
     "a coverage instead of alpha, `paper`": [("--preset", "paper", level, 0.9) for level in ("--alpha", "--coverage")],
     "`satellite-mccnn` instead of `satellite`": ((), ("--preset", "satellite-mccnn")),
     "`mccnn` instead of `paper`": [("--preset", name) for name in ("paper", "mccnn")],
-    "`cross_check.method: accurate`": ((), ("--set", "cross_check.method=accurate")),
+    "`cross_check.method: accurate`": [
+        ("--alpha", 0.9, "--set", f"cross_check.method={method}") for method in ("fast", "accurate")
+    ],
     "`products.compression: zstd`": ((), ("--set", "products.compression=zstd")),
 }
 
