@@ -66,7 +66,7 @@ def test_readme__begins_with_commands_that_work_without_an_environment() -> None
     assert "make test" in first
     assert all(re.search(rf"^{name}: ", (ROOT / "Makefile").read_text(), re.MULTILINE) for name in ("demo", "test"))
     steps = (ROOT / ".ci" / "run").read_text()
-    assert steps.index("--skip-nothing make test\n") < steps.index("make VENV=")
+    assert steps.index("--skip-nothing make test\n") < steps.index("make EXTRAS=")
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda file: file.name)
