@@ -11,7 +11,7 @@ import rasterio
 from matplotlib.figure import Figure
 
 import sat_intervals
-from sat_intervals.kernels.change import connected, painted
+from sat_intervals.kernels.components import component_sizes
 
 # Row, column and half side in cells, and height in metres, of the blocks.
 BLOCKS = (70, 320, 15, 3), (300, 300, 20, 4), (400, 400, 20, 3), (150, 80, 15, 5), (420, 230, 12, 8), (210, 420, 15, -4)
@@ -38,8 +38,8 @@ def draw(folder: Path, panels, title: str) -> None:
         cells = round(SMALLEST / dataset.res[0] ** 2)
     beyond = np.where(np.abs(difference) > LIMIT, np.sign(difference), 0)
     signs = 2 * np.nan_to_num(beyond).astype(np.int8)
-    beyond = sum(sign * (painted(*connected(signs, sign, cells), (0, 0, *change.shape)) > 0) for sign in (1, -1))
-    shown = difference, np.where(beyond != 0, difference, np.nan), np.where(change != 0, difference, np.nan)
+    beyond = component_sizes(signs, signs != 0) >= cells
+    shown = difference, np.where(beyond, difference, np.nan), np.where(change != 0, difference, np.nan)
     names = f"{title}: difference", f"|difference| > {LIMIT:g} m", "areas of change, false alarms 1 %"
     for panel, values, name in zip(panels, shown, names, strict=True):
         panel.imshow(np.where(np.isfinite(difference), 0.8, 1.0), cmap="gray", vmin=0, vmax=1, interpolation="nearest")

@@ -11,7 +11,7 @@ import numpy as np
 
 from sat_intervals.raster import read_layers, read_place
 from sat_intervals.show.canvas import MapLayer, PlotFrame, draw_layer, draw_map, map_size, page
-from sat_intervals.show.surface_map import _relief
+from sat_intervals.show.relief import relief
 
 CREDIT = "WorldView-3 imagery and LiDAR: IEEE GRSS Data Fusion Contest 2019 (US3D), JHU/APL and IARPA"
 
@@ -28,8 +28,8 @@ def main(lidar: Path, pair: Path, many: Path, target: Path) -> None:
         panels = figure.subplots(1, 4)
         named = ("LiDAR", truth), ("Two images", one[0]), ("Ten images", height)
         for panel, (title, heights) in zip(panels, named, strict=False):
-            relief = _relief(heights, transform.a, transform.a)
-            draw_map(panel, frame, relief, title, cmap="gray", vmin=0, vmax=1)
+            shade = relief(heights, transform.a, transform.a)
+            draw_map(panel, frame, shade, title, cmap="gray", vmin=0, vmax=1)
         draw_layer(panels[-1], frame, MapLayer("Ten: half width", "m", halves, "magma", (0, 10), 0.5))
         for panel in panels:
             panel.set(xticks=[], yticks=[], xlabel="", ylabel="")

@@ -10,7 +10,7 @@ import numpy as np
 
 from sat_intervals.raster import read_layers, read_place
 from sat_intervals.show.canvas import GROUND, MapLayer, PlotFrame, draw_layer, draw_map, map_size, page
-from sat_intervals.show.surface_map import _relief
+from sat_intervals.show.relief import relief
 
 CREDIT = "Pleiades imagery (c) CNES, distribution Airbus DS, published by CNES with Picanteo; Open Licence 2.0 (Etalab)"
 
@@ -28,7 +28,7 @@ def main(out: Path, target: Path) -> None:
     halves = (upper - lower) / 2
     with page(target, (2 * columns + 2.0, rows + 1.0), 90, CREDIT) as figure:
         first, second = figure.subplots(1, 2)
-        draw_map(first, frame, _relief(height, cell, cell), "Surface model, cells of 1 m", cmap="gray", vmin=0, vmax=1)
+        draw_map(first, frame, relief(height, cell, cell), "Surface model, cells of 1 m", cmap="gray", vmin=0, vmax=1)
         title = f"Half width of the intervals, median {np.nanmedian(halves):.2f} m"
         draw_layer(second, frame, MapLayer(title, "m", halves, "magma", (0, 20), 0.5))
 
