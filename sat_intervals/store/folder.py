@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO
 
 from sat_intervals.store.remote import opened_at, reached
 
@@ -32,7 +32,7 @@ class Folder:
     def _path(self, name: str) -> str:
         return f"{self.place}/{name}"
 
-    def opened(self, name: str) -> Any:
+    def opened(self, name: str) -> IO[bytes]:
         """Open a file for reading any part of it."""
         path = self._path(name)
         return open(path, "rb") if self.is_local else opened_at(path)
