@@ -11,13 +11,13 @@ from sat_intervals.demo import DATUM, PIXEL, VIEWS
 TURNS = 0.25, 0.32  # radians from the rows of the scene to those of each raw image
 
 
-def raw_pair(folder, scene, *, off=0.0, slope=0.0):
+def raw_pair(folder, scene, *, off=0.0, slope=0.0, turns=TURNS):
     """Write left.tif and right.tif with RPC tags; the right model is off by lines, and by a slope of them."""
     from scipy.ndimage import affine_transform  # of the extra `dsm`
 
     folder.mkdir(exist_ok=True)
     paths = []
-    for side, pixels, view, turn in zip(("left", "right"), (scene.left, scene.right), VIEWS, TURNS, strict=True):
+    for side, pixels, view, turn in zip(("left", "right"), (scene.left, scene.right), VIEWS, turns, strict=True):
         height, width = pixels.shape
         # column and row in the raw image are `around @ (x, y) + shift`
         around = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])

@@ -20,6 +20,11 @@ from pathlib import Path
 import rasterio
 from candidates import make_pair, search_range
 
+from sat_intervals.demo import PIXEL, make_scene
+
+sys.path.append(str(Path(__file__).parents[1]))
+from raw import raw_pair
+
 HERE = Path(__file__).parent
 CORES = sorted(os.sched_getaffinity(0))
 RUNS = 5
@@ -194,42 +199,42 @@ def file_to_file(folder):
         row("the command itself after its tiles, 8000 x 8000, two processes", f"{seconds:.2f} s for {written:.2f} GB")
 
 
-# Prints processor seconds of `match`, `dsm` and `triangulate` with the cameras of the demo, after imports and kernels.
-HEIGHTS = """
-import json, sys, time
-from pathlib import Path
-import sat_intervals.heights.sensors
-from sat_intervals import make_surface, match_pair, set_geometry, triangulate
-folder = Path(sys.argv[1])
-files = [folder / f"{side}_{kind}.tif" for kind in ("model", "grid") for side in ("left", "right")]
-out, search = folder / "out", {"minimum": int(sys.argv[2]), "maximum": int(sys.argv[3])}
-for _ in range(2):
-    marks = [time.process_time()]
-    for step in (
-        lambda: match_pair(folder / "left.tif", folder / "right.tif", out, {"disparity": search}, overwrite=True),
-        lambda: [set_geometry(out, *files), make_surface([out], out / "dsm.tif", resolution=1.0)],
-        lambda: triangulate(out),
-    ):
-        step()
-        marks.append(time.process_time())
-print(json.dumps([end - start for start, end in zip(marks, marks[1:])]))
+# Prints seconds by stage of `surface` of a raw pair, then of `triangulate`, of some runs after one that is not counted.
+STAGES = """
+import json, sys
+from sat_intervals import surface, triangulate
+from sat_intervals.progress import clocked
+if __name__ == "__main__":
+    left, right, out, resolution, runs = sys.argv[1:]
+    found = []
+    for number in range(int(runs) + 1):
+        seconds, points, made = {}, {}, out + str(number)
+        with clocked(seconds, lambda stage, done, total: None) as progress:
+            surface([left, right], made, {"cluster": {"workers": 1}}, resolution=float(resolution), progress=progress)
+        with clocked(points, lambda stage, done, total: None) as progress:
+            triangulate(made, progress=progress)
+        found.append(seconds | {"points": sum(points.values())})
+    print(json.dumps(found[1:]))
 """
 
 
-def heights(folder, size=3000):
-    """Processor time of surface models and points of the demo beside that of matching it."""
+def stages(folder, size=1800, whole=31000 * 40000):
+    """The stages of a surface of a raw pair on one core, and on paper of a large pair on one worker and on 64."""
     print()
-    row(f"heights of the demo, {size} x {size}, cells of 1 m, processor time", "s/Mpx", "of `match`")
-    row("---", "---", "---")
-    demo, script = folder / "demo", folder / "heights.py"
-    run([str(Path(sys.executable).with_name("sat-intervals")), "demo", str(demo), "--size", *2 * [str(size)]], CORES)
-    run([sys.executable, str(HERE.parents[1] / "docs" / "pictures" / "demo_cameras.py"), str(demo)], CORES)
-    search = json.loads((demo / "run.json").read_text())["settings"]["disparity"]
-    script.write_text(HEIGHTS)
-    printed = run([sys.executable, str(script), str(demo), str(search["minimum"]), str(search["maximum"])], CORES)[-1]
-    match, *others = json.loads(printed.splitlines()[-1])
-    for name, seconds in zip(("match", "dsm", "triangulate"), (match, *others), strict=True):
-        row(f"`{name}`", f"{seconds / size**2 * 1e6:.2f}", f"{seconds / match:.2f}")
+    row(f"`surface`, raw pair of {size} x {size}", "s per million pixels", "of `match`", "one worker", "64 workers")
+    row(*["---"] * 5)
+    (folder / "stages.py").write_text(STAGES)
+    images = raw_pair(folder / "raw", make_scene(size, size), turns=(0.0, 0.0))  # no corners without data
+    command = [sys.executable, folder / "stages.py", *images, folder / "surface", PIXEL, RUNS]
+    found = json.loads(run([str(part) for part in command], CORES[:1])[-1].splitlines()[-1])
+    seconds = {name: statistics.median(one[name] for one in found) / size**2 for name in found[0]}
+    seconds["files"] += seconds.pop("bands")
+    match = seconds["tiles"] + seconds["files"]
+    for name in ("resampling", "tiles", "files", "cells", "points"):
+        pixel = seconds.pop(name)
+        times = f"{whole * pixel / 60:.0f} min", f"{whole * pixel / 64:.0f} s"
+        row(name, f"{1e6 * pixel:.2f}", f"{pixel / match:.2f}", *times)
+    row("others: " + ", ".join(seconds), f"{1e6 * sum(seconds.values()):.2f}", "", "", "")
 
 
 # Options without a setting, and with it.
@@ -280,7 +285,7 @@ def main():
             "mccnn": mccnn,
             "files": partial(file_to_file, Path(folder)),
             "settings": partial(settings, Path(folder)),
-            "heights": partial(heights, Path(folder)),
+            "stages": partial(stages, Path(folder)),
         }
         for name in sys.argv[1:] or parts:
             parts[name]()
