@@ -1,4 +1,4 @@
-"""Figures of docs/volumes.md: disparities of OpenCV's SGBM on WorldView-3 pairs, audited by `intervals_around`."""
+"""Figures of docs/volumes.md: disparities of OpenCV's SGBM on pairs with truth, audited by `intervals_around`."""
 
 import json
 import os
@@ -12,10 +12,17 @@ from sat_intervals import intervals_around
 
 DATA = Path(os.environ.get("SAT_INTERVALS_SHARED", "../shared")) / "data"
 # Rows by which the right image is lower, to the nearest: SGBM does not take them out.
-PAIRS = {"us3d_jax_079": 1, "us3d_jax_559": 0}
+PAIRS = {
+    "us3d_jax_079": 1,
+    "us3d_jax_559": 0,
+    "synth_toulouse_georef": 0,
+    "synth_toulouse_nodata": 0,
+    "synth_toulouse_urban": 0,
+}
 # A larger error is a blunder, in pixels.
 BLUNDER = 3
 SETTINGS = {
+    "paper": {"preset": "paper", "rows": "auto"},
     "satellite, 0.9": {"preset": "satellite"},
     "satellite, 0.8": {"preset": "satellite", "interval": {"coverage": 0.8}},
 }
