@@ -37,7 +37,7 @@ lint: $(READY) $(VENV)/.has-lint
 	$(BIN)/mypy
 	$(PYTEST) --quiet tests/test_architecture.py
 
-# The tables of docs/speed.md: this project beside its peers; about fifteen minutes.
+# The tables of docs/speed.md, and stages in docs/clusters.md: this project beside its peers; about half an hour.
 bench: $(VENV)/.has-bench,dsm
 	$(BIN)/python tests/benchmarks/table.py
 
@@ -78,7 +78,7 @@ voids-bench: $(VENV)/.has-dsm
 coverage: $(VENV)/.has-mccnn
 	$(BIN)/python -W ignore tests/benchmarks/coverage_tables.py
 
-# The tables of docs/comparison.md, with the commands cars and s2p that are on PATH; an hour, nearly all of it CARS.
+# The tables of docs/comparison.md, with the commands cars and s2p that are on PATH; twenty minutes, most of it CARS.
 comparison: $(VENV)/.has-dsm,test
 	$(BIN)/python -W ignore docs/comparison.py $(MANY) build/comparison
 

@@ -203,17 +203,17 @@ def file_to_file(folder):
 STAGES = """
 import json, sys
 from sat_intervals import surface, triangulate
-from sat_intervals.progress import clocked
+from sat_intervals.progress import clocked, timed
 if __name__ == "__main__":
     left, right, out, resolution, runs = sys.argv[1:]
     found = []
     for number in range(int(runs) + 1):
-        seconds, points, made = {}, {}, out + str(number)
+        seconds, made = {}, out + str(number)
         with clocked(seconds, lambda stage, done, total: None) as progress:
             surface([left, right], made, {"cluster": {"workers": 1}}, resolution=float(resolution), progress=progress)
-        with clocked(points, lambda stage, done, total: None) as progress:
-            triangulate(made, progress=progress)
-        found.append(seconds | {"points": sum(points.values())})
+        with timed(seconds, "points"):
+            triangulate(made)
+        found.append(seconds)
     print(json.dumps(found[1:]))
 """
 
@@ -221,7 +221,8 @@ if __name__ == "__main__":
 def stages(folder, size=1800, whole=31000 * 40000):
     """The stages of a surface of a raw pair on one core, and on paper of a large pair on one worker and on 64."""
     print()
-    row(f"`surface`, raw pair of {size} x {size}", "s per million pixels", "of `match`", "one worker", "64 workers")
+    heads = "s per million pixels", "of tiles and files", "one worker", "64 workers"
+    row(f"`surface`, raw pair of {size} x {size}", *heads)
     row(*["---"] * 5)
     (folder / "stages.py").write_text(STAGES)
     images = raw_pair(folder / "raw", make_scene(size, size), turns=(0.0, 0.0))  # no corners without data
@@ -229,11 +230,11 @@ def stages(folder, size=1800, whole=31000 * 40000):
     found = json.loads(run([str(part) for part in command], CORES[:1])[-1].splitlines()[-1])
     seconds = {name: statistics.median(one[name] for one in found) / size**2 for name in found[0]}
     seconds["files"] += seconds.pop("bands")
-    match = seconds["tiles"] + seconds["files"]
+    matching = seconds["tiles"] + seconds["files"]
     for name in ("resampling", "tiles", "files", "cells", "points"):
         pixel = seconds.pop(name)
         times = f"{whole * pixel / 60:.0f} min", f"{whole * pixel / 64:.0f} s"
-        row(name, f"{1e6 * pixel:.2f}", f"{pixel / match:.2f}", *times)
+        row(name, f"{1e6 * pixel:.2f}", f"{pixel / matching:.2f}", *times)
     row("others: " + ", ".join(seconds), f"{1e6 * sum(seconds.values()):.2f}", "", "", "")
 
 
