@@ -22,7 +22,6 @@ PAIRS = {
 # A larger error is a blunder, in pixels.
 BLUNDER = 3
 SETTINGS = {
-    "paper": {"preset": "paper", "rows": "auto"},
     "satellite, 0.9": {"preset": "satellite"},
     "satellite, 0.8": {"preset": "satellite", "interval": {"coverage": 0.8}},
 }
